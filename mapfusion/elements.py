@@ -1,0 +1,159 @@
+"""The nouns of a vector map: kinds, regions, the map of one instant and the map of a whole drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+
+class ElementKind(IntEnum):
+    """What a polyline stands for; the numbers are the class ids of nuScenes and Argoverse 2 benchmarks."""
+
+    PED_CROSSING = 0
+    DIVIDER = 1
+    BOUNDARY = 2
+
+    @property
+    def label(self) -> str:
+        """Lower-case name as written to files: ``ped_crossing``, ``divider``, ``boundary``."""
+        return self.name.lower()
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether elements of this kind are closed rings (first vertex repeated at the end)."""
+        return self is ElementKind.PED_CROSSING
+
+
+@dataclass(frozen=True)
+class RegionOfInterest:
+    """The rectangle around the car that is mapped at one instant.
+
+    Attributes:
+        length: extent along x (forward), metres; x lies in ``[-length / 2, length / 2]``.
+        width: extent along y (left), metres.
+    """
+
+    length: float = 60.0
+    width: float = 30.0
+
+    @property
+    def size(self) -> Float:
+        """``(2,) float64``: length and width, metres."""
+        return np.array([self.length, self.width])
+
+
+@dataclass(frozen=True)
+class FrameMap:
+    """What the mapper saw at one instant: polylines in the ego frame, as arrays of equal length.
+
+    Attributes:
+        timestamp: integer nanoseconds.
+        ego_to_global: ``(4, 4) float64``, maps ego coordinates to the data set's metric global frame.
+        roi: the region that was looked at.
+        kinds: ``(n,) int64`` of :class:`ElementKind`.
+        scores: ``(n,) float64`` in ``[0, 1]``.
+        track_ids: ``(n,) int64``, stable over a log and never reused; ``-1`` for an element that is reported
+            (for precision-recall curves) but not tracked. Only tracked elements enter a global map.
+        polylines: ``n`` arrays ``(k_i, 2) float64``, metres, ego frame; crossings are closed rings.
+        forecasts: ``n`` arrays ``(p, 2) float64``, metres, where each element is expected in the ego frame of
+            the *next* instant; empty arrays where there is no forecast. ``None`` without a forecaster.
+        segmentation: ``(3, rows, columns) float32`` probabilities per kind over the ROI; row 0 is the largest
+            y, column 0 the smallest x. ``None`` if the mapper makes none.
+        history_masks: ``(n, rows, columns) float32``, raster memory of each element, same grid convention.
+    """
+
+    timestamp: int
+    ego_to_global: Float
+    roi: RegionOfInterest
+    kinds: Integer
+    scores: Float
+    track_ids: Integer
+    polylines: tuple[Float, ...]
+    forecasts: tuple[Float, ...] | None = None
+    segmentation: NDArray[np.float32] | None = None
+    history_masks: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        lengths = {len(self.kinds), len(self.scores), len(self.track_ids), len(self.polylines)}
+        if len(lengths) != 1:
+            raise ValueError(f"kinds, scores, track_ids and polylines differ in length: {sorted(lengths)}")
+
+    def __len__(self) -> int:
+        return len(self.polylines)
+
+    def select(self, mask: NDArray[np.bool_]) -> FrameMap:
+        """Return the elements where ``mask`` (``(n,) bool``) is true."""
+        rows = np.flatnonzero(mask)
+        return replace(
+            self,
+            kinds=self.kinds[rows],
+            scores=self.scores[rows],
+            track_ids=self.track_ids[rows],
+            polylines=tuple(self.polylines[row] for row in rows),
+            forecasts=None if self.forecasts is None else tuple(self.forecasts[row] for row in rows),
+            history_masks=None if self.history_masks is None else self.history_masks[rows],
+        )
+
+    @property
+    def tracked(self) -> FrameMap:
+        """Only the elements that carry a track id."""
+        return self.select(self.track_ids >= 0)
+
+
+@dataclass(frozen=True)
+class MapElement:
+    """One element of a global map.
+
+    Attributes:
+        kind: what it is.
+        points: ``(n, 2) float64``, metres, global frame; a crossing is a closed ring.
+        confidence: in ``[0, 1]``.
+        observations: number of frames that saw it.
+        first_seen, last_seen: integer nanoseconds.
+        track_ids: ids of the tracks that were fused into it, ascending.
+        deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known.
+    """
+
+    kind: ElementKind
+    points: Float
+    confidence: float
+    observations: int
+    first_seen: int
+    last_seen: int
+    track_ids: tuple[int, ...] = ()
+    deviation: Float | None = None
+
+    @property
+    def length(self) -> float:
+        """Length of the line (perimeter of a ring), metres."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The map of a whole drive: elements in one metric global frame, and where they came from."""
+
+    elements: tuple[MapElement, ...]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.elements)
+
+    def __iter__(self) -> Iterator[MapElement]:
+        return iter(self.elements)
+
+    def of_kind(self, kind: ElementKind) -> tuple[MapElement, ...]:
+        """Return the elements of one kind, in map order."""
+        return tuple(element for element in self.elements if element.kind == kind)
+
+    def length(self, kind: ElementKind) -> float:
+        """Total length of one kind, metres."""
+        return sum(element.length for element in self.of_kind(kind))

@@ -1,0 +1,1 @@
+"""Writers and readers of global maps, one file per format."""

@@ -1,0 +1,1 @@
+"""Where driving logs come from: one file per source behind one protocol, ground truth included."""

@@ -1,0 +1,148 @@
+"""The protocol of every source of driving logs: a source lists scenes, a scene yields frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap, RegionOfInterest
+
+Float = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Progress = Callable[[int, int, str], None]
+"""Called as ``progress(done, total, what)`` while something long is prepared."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera on the car (x right, y down, z forward in its own frame).
+
+    Attributes:
+        name: as the data set calls it, for example ``CAM_FRONT``.
+        width, height: pixels of the images as they are stored.
+        intrinsics: ``(3, 3) float64`` for images of that size.
+        camera_to_ego: ``(4, 4) float64``.
+    """
+
+    name: str
+    width: int
+    height: int
+    intrinsics: Float
+    camera_to_ego: Float
+
+
+Rig = tuple[Camera, ...]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the car saw at one instant.
+
+    Attributes:
+        scene: name of the scene.
+        index: position in the scene, from 0.
+        token: the data set's own unique name of the frame.
+        timestamp: integer nanoseconds.
+        ego_to_global: ``(4, 4) float64``; on nuScenes the ego origin lies at the lidar's x, y, as in the
+            official vector-map data sets.
+        rig: the cameras of the car, always all of them.
+        images: where each camera's image lies, by camera name. A camera without an image is absent.
+    """
+
+    scene: str
+    index: int
+    token: str
+    timestamp: int
+    ego_to_global: Float
+    rig: Rig
+    images: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """Ground truth of one instant, clipped to the ROI.
+
+    Attributes:
+        kinds: ``(n,) int64`` of :class:`mapfusion.ElementKind`.
+        polylines: ``n`` arrays ``(k_i, 2) float64``, metres, ego frame; crossings are closed rings.
+        element_ids: ``(n,) int64``, which element of the source's map each piece came from (unique per kind);
+            -1 where the source cannot tell.
+    """
+
+    kinds: NDArray[np.int64]
+    polylines: tuple[Float, ...]
+    element_ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """One line of ``predmapnet scenes``.
+
+    Attributes:
+        name: what the user types.
+        split: ``train``, ``val`` or ``test``.
+        frames: number of key frames.
+        location: town, city or map name.
+        ready: False while a demo scene has not been rendered yet.
+        description: a few words for a person.
+    """
+
+    name: str
+    split: str
+    frames: int
+    location: str
+    ready: bool = True
+    description: str = ""
+
+
+class Georeference(Protocol):
+    """From the metric global frame to WGS84; used by exporters only."""
+
+    name: str
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        ...
+
+
+class Scene(Protocol):
+    """One driving log, opened."""
+
+    info: SceneInfo
+    rig: Rig
+    georeference: Georeference | None
+
+    def __len__(self) -> int: ...
+
+    def frame(self, index: int) -> Frame:
+        """Return frame ``index``; images are named, not read. Raises UserError for a broken pose."""
+        ...
+
+    def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
+        """Return the ground truth of frame ``index``, or None where the source has no map."""
+        ...
+
+    def truth_map(self) -> GlobalMap | None:
+        """Return the ground-truth map of the whole log in the global frame, unclipped, or None."""
+        ...
+
+
+class SceneSource(Protocol):
+    """A data set on disk (or the demo world, which makes itself)."""
+
+    name: str
+    root: Path
+    synthetic: bool
+
+    def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
+        """List what is there, in the data set's order; ``split`` narrows it. Raises UserError."""
+        ...
+
+    def open(self, scene: str, progress: Progress | None = None) -> Scene:
+        """Open one scene by name; a name that does not exist raises UserError with the nearest names."""
+        ...

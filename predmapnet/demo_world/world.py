@@ -1,0 +1,155 @@
+"""The nouns of the demo world: what is true about the road, what stands on it, and how it looks.
+
+A :class:`VectorMap` and a :class:`Trajectory` come from a town generator or from a real data set;
+:func:`predmapnet.demo_world.dressing.dress` turns them into a :class:`World`, which the renderer draws.
+Coordinates are metres in the global frame; the road surface is the plane z = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely import Polygon
+
+Float = NDArray[np.float64]
+
+
+class LineStyle(StrEnum):
+    """How a divider is painted."""
+
+    SOLID = "solid"
+    DASHED = "dashed"
+    DOUBLE_SOLID = "double_solid"
+    SOLID_DASHED = "solid_dashed"
+    UNPAINTED = "unpainted"
+
+
+class CrossingStyle(StrEnum):
+    """How a pedestrian crossing is painted."""
+
+    ZEBRA = "zebra"
+    """Bars along the direction of travel of the cars."""
+    LADDER = "ladder"
+    """The same bars between two lines across the road."""
+    LINES = "lines"
+    """Only the two lines across the road."""
+
+
+class Look(StrEnum):
+    """Light and weather of a scene."""
+
+    DAY = "day"
+    DUSK = "dusk"
+    OVERCAST = "overcast"
+    WET = "wet"
+    NIGHT = "night"
+
+
+@dataclass(frozen=True)
+class Divider:
+    """A line between lanes.
+
+    Attributes:
+        points: ``(n, 2) float64``, metres.
+        style: paint.
+        colour: ``white`` or ``yellow``.
+        opposite: True where it separates opposite directions (``road_divider`` of nuScenes).
+    """
+
+    points: Float
+    style: LineStyle
+    colour: str = "white"
+    opposite: bool = False
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """A pedestrian crossing: a polygon and the direction in which pedestrians walk, radians."""
+
+    polygon: Polygon
+    style: CrossingStyle
+    heading: float
+
+
+@dataclass(frozen=True)
+class VectorMap:
+    """What is true about the road, the source of all ground truth.
+
+    Attributes:
+        road_segments: drivable surface; islands and medians are holes (or gaps).
+        lanes: lane polygons, inside the road segments (may be empty for maps without lanes).
+        crossings, dividers: painted elements.
+        walkways: sidewalks; may be empty, then the dressing makes them up along the kerb.
+        parking: parking bays (part of the road surface).
+        stop_lines: polygons.
+    """
+
+    road_segments: tuple[Polygon, ...]
+    lanes: tuple[Polygon, ...]
+    crossings: tuple[Crossing, ...]
+    dividers: tuple[Divider, ...]
+    walkways: tuple[Polygon, ...] = ()
+    parking: tuple[Polygon, ...] = ()
+    stop_lines: tuple[Polygon, ...] = ()
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the ego car is at each key frame.
+
+    Attributes:
+        timestamps: ``(n,) int64``, nanoseconds.
+        ego_to_global: ``(n, 4, 4) float64``; ego origin on the ground below the rear axle, small pitch and
+            roll included.
+    """
+
+    timestamps: NDArray[np.int64]
+    ego_to_global: Float
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A patch of ground of one material, painted over what lies below it."""
+
+    polygon: Polygon
+    material: str
+
+
+@dataclass(frozen=True)
+class Solids:
+    """Things that stand on the ground and occlude, as arrays of equal length.
+
+    Attributes:
+        shape: ``(n,)`` of ``box``, ``cylinder``, ``ellipsoid`` (crowns of trees).
+        centre: ``(n, 3) float64``, metres.
+        size: ``(n, 3) float64``: length, width, height, metres.
+        yaw: ``(n,) float64``, radians.
+        colour: ``(n, 3) float64``, linear RGB in [0, 1].
+        texture: ``(n,)`` of ``plain``, ``facade``, ``vehicle``, ``foliage``, ``bark``.
+        velocity: ``(n, 2) float64``, metres per second; moving vehicles follow a straight line around their
+            position at the trajectory's first timestamp. Zero for what stands still.
+    """
+
+    shape: NDArray[np.str_]
+    centre: Float
+    size: Float
+    yaw: Float
+    colour: Float
+    texture: NDArray[np.str_]
+    velocity: Float
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything that the renderer needs to draw one scene. Deterministic in ``seed``."""
+
+    name: str
+    seed: int
+    look: Look
+    map: VectorMap
+    trajectory: Trajectory
+    surfaces: tuple[Surface, ...] = field(repr=False)
+    solids: Solids = field(repr=False)

@@ -1,0 +1,1 @@
+"""The metrics of the field and of the global map."""

@@ -1,0 +1,120 @@
+"""What goes into the network, what comes out, and the state that is handed from frame to frame.
+
+``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
+``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
+(row 0 is the largest y, column 0 the smallest x). Points are normalised to ``[0, 1]`` over the ROI: x forward, y left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass
+class FrameInputs:
+    """One instant of ``B`` streams that share a camera rig.
+
+    Attributes:
+        images: ``(B, N, 3, h, w) float32``, RGB, normalised.
+        camera_valid: ``(B, N) bool``; False masks a missing or late camera out.
+        ego_to_global: ``(B, 4, 4) float64``.
+    """
+
+    images: Tensor
+    camera_valid: Tensor
+    ego_to_global: Tensor
+
+
+@dataclass
+class Instances:
+    """Map instances that live on after a frame: the tracks of the next one. Rows are padded.
+
+    Attributes:
+        valid: ``(B, T) bool``.
+        track_ids: ``(B, T) int64``, -1 in padding.
+        labels: ``(B, T) int64``.
+        scores: ``(B, T)``.
+        misses: ``(B, T) int64``, frames since the score was last above the tracking threshold.
+        queries: ``(B, T, C)``, last decoder layer's embedding.
+        points: ``(B, T, P, 2)``, normalised, in the ego frame of the instant they were decoded at.
+        masks: ``(B, T, H, W)``, probabilities of the current frame.
+    """
+
+    valid: Tensor
+    track_ids: Tensor
+    labels: Tensor
+    scores: Tensor
+    misses: Tensor
+    queries: Tensor
+    points: Tensor
+    masks: Tensor
+
+
+@dataclass
+class StreamState:
+    """Everything the network remembers between two frames; nothing is hidden in a module.
+
+    Attributes:
+        instances: the tracks, as of the last frame.
+        history_maps: ``(B, T, H, W)``, history raster memory M of Sec. 3.3, in the last frame's ego frame.
+        point_history: ``(B, T, n, P, 2)``, last n polylines of each track, oldest first, each in the ego frame of
+            its own instant (Sec. 3.5), normalised.
+        point_history_valid: ``(B, T, n) bool``.
+        forecasts: ``(B, T, P, 2)``, where each track is expected in the next ego frame, normalised.
+        next_track_id: ``(B,) int64``.
+        ego_to_global: ``(B, 4, 4) float64`` of the last frame.
+        bev_memory: ``(B, K, C_bev, H, W)``, past BEV maps (newest last).
+        bev_memory_pose: ``(B, K, 4, 4) float64``.
+        bev_memory_valid: ``(B, K) bool``.
+    """
+
+    instances: Instances
+    history_maps: Tensor
+    point_history: Tensor
+    point_history_valid: Tensor
+    forecasts: Tensor
+    next_track_id: Tensor
+    ego_to_global: Tensor
+    bev_memory: Tensor
+    bev_memory_pose: Tensor
+    bev_memory_valid: Tensor
+
+
+@dataclass
+class LayerPredictions:
+    """What one decoder layer says of each row; rows are ``T`` tracks, then ``Q`` detections.
+
+    Attributes:
+        logits: ``(B, T + Q, 3)`` or None in layers that do not classify.
+        points: ``(B, T + Q, P, 2)``, normalised, or None in layers that have no polyline yet.
+        masks: ``(B, T + Q, H', W')`` logits, or None in layers without masks.
+    """
+
+    logits: Tensor | None
+    points: Tensor | None
+    masks: Tensor | None
+
+
+@dataclass
+class FrameOutputs:
+    """What the network says of one instant.
+
+    Attributes:
+        layers: all supervised layers, first to last; the last one is the result.
+        queries: ``(B, T + Q, C)``, embedding of the last layer.
+        row_valid: ``(B, T + Q) bool``; False for padded track rows.
+        row_track_ids: ``(B, T + Q) int64``; -1 for detections.
+        segmentation: ``(B, 3, H_s, W_s)`` logits.
+        bev: ``(B, C_bev, H, W)``, raw BEV features that go into the memory.
+        depth: ``(B, N, D, h', w')`` logits of the auxiliary head, or None.
+    """
+
+    layers: list[LayerPredictions]
+    queries: Tensor
+    row_valid: Tensor
+    row_track_ids: Tensor
+    segmentation: Tensor
+    bev: Tensor
+    depth: Tensor | None = None

@@ -1,0 +1,1 @@
+"""Losses, matching, clips and the stages of training."""

@@ -1,0 +1,1 @@
+"""The shipped checkpoint and what reads it."""
