@@ -22,6 +22,9 @@ Progress = Callable[[int, int, str], None]
 class Camera:
     """A pinhole camera on the car (x right, y down, z forward in its own frame).
 
+    Pixel ``(i, j)`` covers ``[i, i + 1) x [j, j + 1)``: the centre of the first pixel is at (0.5, 0.5), so that an
+    image scaled by ``s`` has the intrinsics ``diag(s, s, 1) @ intrinsics``.
+
     Attributes:
         name: as the data set calls it, for example ``CAM_FRONT``.
         width, height: pixels of the images as they are stored.
