@@ -1,0 +1,90 @@
+"""What every per-frame metric takes: a prediction beside its ground truth, checked once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from mapfusion.elements import ElementKind, FrameMap
+from predmapnet.datasets.source import FrameTruth
+from predmapnet.errors import UserError
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+SIMPLIFY_TOLERANCE = 0.2
+"""Metres; the official evaluation simplifies the ground truth by this much before it measures."""
+
+
+@dataclass(frozen=True)
+class EvaluationFrame:
+    """One instant as the metrics see it.
+
+    Attributes:
+        scene: name of the scene.
+        index: position in the scene, from 0; the frames of a scene are consecutive.
+        predicted: what was predicted, in the ego frame.
+        truth: ground truth of the same ROI, in the ego frame, not simplified.
+
+    Raises:
+        UserError: a polyline is empty or not finite, a score is not finite, or a kind does not exist; the
+            message names the scene, the frame and the element.
+    """
+
+    scene: str
+    index: int
+    predicted: FrameMap
+    truth: FrameTruth
+
+    def __post_init__(self) -> None:
+        where = f"Scene {self.scene}, frame {self.index}"
+        _check_elements(f"{where}, prediction", self.predicted.kinds, self.predicted.polylines)
+        _check_elements(f"{where}, ground truth", self.truth.kinds, self.truth.polylines)
+        bad = np.flatnonzero(~np.isfinite(self.predicted.scores))
+        if len(bad):
+            score = self.predicted.scores[bad[0]]
+            raise UserError(f"{where}, prediction {bad[0]}: the score is {score}, not a finite number.")
+
+    @property
+    def name(self) -> str:
+        """Scene and index, as messages and reports call the frame."""
+        return f"{self.scene}/{self.index}"
+
+
+def _check_elements(where: str, kinds: Integer, polylines: Sequence[Float]) -> None:
+    for row, points in enumerate(polylines):
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0:
+            raise UserError(f"{where} {row}: a polyline must be (n, 2) with n >= 1, this one is {points.shape}.")
+    if len(polylines) and not np.isfinite(np.concatenate(polylines)).all():
+        row = next(row for row, points in enumerate(polylines) if not np.isfinite(points).all())
+        raise UserError(f"{where} {row}: the polyline holds NaN or infinite coordinates.")
+    unknown = np.flatnonzero(~np.isin(kinds, list(ElementKind)))
+    if len(unknown):
+        raise UserError(f"{where} {unknown[0]}: there is no element kind {kinds[unknown[0]]} (0, 1 and 2 exist).")
+
+
+def simplified(polylines: Sequence[Float]) -> tuple[Float, ...]:
+    """Simplify lines by 0.2 m with topology kept, as the official evaluation does with its ground truth.
+
+    Args:
+        polylines: arrays ``(k, 2)``, metres.
+
+    Returns:
+        One array ``(k', 2) float64`` per line, ``k' <= k``; one-point lines are returned unchanged.
+    """
+    drawable = [row for row, points in enumerate(polylines) if len(points) >= 2]
+    result = list(polylines)
+    if drawable:
+        counts = [len(polylines[row]) for row in drawable]
+        coordinates = np.concatenate([polylines[row] for row in drawable])
+        lines = shapely.linestrings(coordinates, indices=np.repeat(np.arange(len(drawable)), counts))
+        shorter = shapely.simplify(lines, SIMPLIFY_TOLERANCE, preserve_topology=True)
+        vertices, owner = shapely.get_coordinates(shorter, return_index=True)
+        parts = np.split(vertices, np.searchsorted(owner, np.arange(1, len(drawable))))
+        for row, points in zip(drawable, parts, strict=True):
+            result[row] = points
+    return tuple(result)
