@@ -1,0 +1,138 @@
+"""The demo world's fixed scenes: which exist, what is in them, and where they are kept once rendered."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from predmapnet.datasets.source import Progress, SceneInfo
+from predmapnet.demo_world.routes import KEY_FRAMES, drive
+from predmapnet.demo_world.town import Town, build_town
+from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
+from predmapnet.errors import UserError
+
+WORLD_VERSION = 1
+"""Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
+
+SPLITS: dict[str, range] = {"train": range(201, 601), "val": range(1, 11), "test": range(101, 111)}
+"""Scene numbers. Each scene has a town of its own whose seed is its number, so that no town is in two splits."""
+
+LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
+"""How often each look is drawn for a training scene."""
+
+_TEN_LOOKS = (
+    Look.DAY,
+    Look.OVERCAST,
+    Look.DAY,
+    Look.WET,
+    Look.DAY,
+    Look.DUSK,
+    Look.NIGHT,
+    Look.DAY,
+    Look.OVERCAST,
+    Look.DAY,
+)
+"""Looks of the ten validation and the ten test scenes, in order: the same shares, and every look at least once."""
+
+
+def scene_infos(split: str | None = None) -> tuple[SceneInfo, ...]:
+    """List the scenes of one split, or of all. Raises UserError for a split that does not exist."""
+    if split is not None and split not in SPLITS:
+        raise UserError(f"The demo world has no split '{split}'. It has: {', '.join(SPLITS)}.")
+    return tuple(
+        SceneInfo(
+            name=f"scene-{number:04d}",
+            split=name,
+            frames=KEY_FRAMES,
+            location=f"town-{number:04d}",
+            ready=False,
+            description=f"demo world, {look_of(f'scene-{number:04d}')}",
+        )
+        for name, numbers in SPLITS.items()
+        if split in (None, name)
+        for number in numbers
+    )
+
+
+def scene_number(name: str) -> int:
+    """The number of a scene, which is the seed of its town. Raises UserError for a name that does not exist."""
+    names = {f"scene-{number:04d}": number for numbers in SPLITS.values() for number in numbers}
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
+        raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {', '.join(near)}.")
+    return names[name]
+
+
+def look_of(name: str) -> Look:
+    """Light and weather of a scene."""
+    number = scene_number(name)
+    if number not in SPLITS["train"]:
+        return _TEN_LOOKS[(number - 1) % 10]
+    random = np.random.default_rng([0x6C6F6F6B, number])
+    return list(LOOK_SHARES)[int(random.choice(len(LOOK_SHARES), p=list(LOOK_SHARES.values())))]
+
+
+@lru_cache(maxsize=8)
+def town_of(name: str) -> Town:
+    """The town that a scene drives through."""
+    return build_town(scene_number(name))
+
+
+def vector_map(name: str) -> VectorMap:
+    """What is true about the road in a scene."""
+    return town_of(name).vector_map
+
+
+def trajectory(name: str) -> Trajectory:
+    """Where the car is at each key frame of a scene."""
+    return drive(town_of(name), scene_number(name))
+
+
+def build_world(name: str) -> World:
+    """Everything the renderer needs to draw a scene."""
+    from predmapnet.demo_world.dressing import dress
+
+    return dress(vector_map(name), trajectory(name), look_of(name), scene_number(name), name)
+
+
+def default_cache() -> Path:
+    """The folder for things that can be made again: ``PREDMAPNET_CACHE``, or the platform's cache folder."""
+    chosen = os.environ.get("PREDMAPNET_CACHE")
+    if chosen:
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "predmapnet"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "predmapnet"
+
+
+def scene_folder(name: str, cache: Path) -> Path:
+    """Where a scene lies as a nuScenes data set, whether it has been rendered or not."""
+    return cache / f"demo-world-v{WORLD_VERSION}" / name
+
+
+def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Path:
+    """Render a scene unless that has been done.
+
+    Args:
+        name: for example ``scene-0103``.
+        cache: the folder that holds all scenes.
+        progress: called once per key frame.
+
+    Returns:
+        The root of a nuScenes data set (``v1.0-mini``, ``samples``, ``maps``) with this one scene.
+
+    Raises:
+        UserError: the scene does not exist, or the cache cannot be written.
+    """
+    folder = scene_folder(name, cache)
+    scene_number(name)
+    if not folder.exists():
+        from predmapnet.demo_world.nuscenes_writer import write_scene
+
+        write_scene(build_world(name), folder, progress)
+    return folder
