@@ -1,0 +1,110 @@
+"""Per-frame results survive the way to disk and back; what cannot be read is refused in plain words."""
+
+import json
+import pickle
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from mapfusion.elements import FrameMap, RegionOfInterest
+from predmapnet.errors import UserError
+from predmapnet.evaluation.frames_io import FrameWriter, read_frames, write_frames
+from predmapnet.evaluation.submission import read_submission
+
+
+def frame_map(count, generator, forecasts=True):
+    lines = tuple(generator.normal(size=(generator.integers(1, 30), 2)) for _ in range(count))
+    return FrameMap(
+        timestamp=1_533_151_603_547_590_000,
+        ego_to_global=generator.normal(size=(4, 4)),
+        roi=RegionOfInterest(100.0, 50.0),
+        kinds=generator.integers(0, 3, count),
+        scores=generator.random(count),
+        track_ids=generator.integers(-1, 2**40, count),
+        polylines=lines,
+        forecasts=tuple(np.zeros((0, 2)) if row % 2 else line + 1.0 for row, line in enumerate(lines))
+        if forecasts
+        else None,
+    )
+
+
+def test_frames_come_back_bit_by_bit(tmp_path):
+    generator = np.random.default_rng(1)
+    maps = [frame_map(count, generator, forecasts=count != 3) for count in [5, 0, 3, *[2] * 100]]
+    path = tmp_path / "frames.parquet"
+    write_frames(path, "scene-0103", maps, {"version": "0.1.0", "dataset": "demo"})
+    stored = read_frames(path)
+    assert stored.provenance == {"version": "0.1.0", "dataset": "demo"}
+    assert stored.scenes == ("scene-0103",)
+    assert [frame.index for frame in stored.frames] == list(range(len(maps)))
+    for read, written in zip(stored.frames, maps, strict=True):
+        got = read.frame_map
+        assert (got.timestamp, got.roi) == (written.timestamp, written.roi)
+        for name in ("ego_to_global", "kinds", "scores", "track_ids"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(written, name))
+        for lines, expected in ((got.polylines, written.polylines), (got.forecasts, written.forecasts)):
+            assert (lines is None) == (expected is None)
+            for line, other in zip(lines or (), expected or (), strict=True):
+                np.testing.assert_array_equal(line, other)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["frames.parquet"]
+
+
+def test_the_same_frames_give_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        write_frames(tmp_path / name, "s", [frame_map(4, np.random.default_rng(0))], {"b": 1, "a": 2})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_an_interrupted_run_leaves_no_file(tmp_path):
+    path = tmp_path / "frames.parquet"
+    with pytest.raises(KeyboardInterrupt), FrameWriter(path, {}) as writer:
+        writer.write("s", 0, frame_map(2, np.random.default_rng(0)))
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_read_is_refused(tmp_path):
+    pickled = tmp_path / "results.parquet"
+    pickled.write_bytes(pickle.dumps({"results": {}}))
+    other = tmp_path / "other.parquet"
+    pq.write_table(pa.table({"a": [1]}), other)
+    whole = tmp_path / "whole.parquet"
+    write_frames(whole, "s", [frame_map(4, np.random.default_rng(0))], {})
+    cut = tmp_path / "cut.parquet"
+    cut.write_bytes(whole.read_bytes()[:-200])
+    for path, message in [
+        (pickled, "pickle"),
+        (other, "no version in its metadata"),
+        (cut, "cannot be read as Parquet"),
+        (tmp_path / "absent.parquet", "no file"),
+    ]:
+        with pytest.raises(UserError, match=message):
+            read_frames(path)
+
+
+def test_a_submission_is_read_by_token(tmp_path):
+    path = tmp_path / "submission.json"
+    entry = {"vectors": [[[0, 1], [2, 3]], [[4, 5, 9], [6, 7, 9]]], "scores": [0.5, 0.25], "labels": [1, 2]}
+    path.write_text(json.dumps({"meta": {}, "results": {"a": entry, "b": entry | {"global_ids": [7, 9]}}}))
+    frames = read_submission(path)
+    assert frames["a"].track_ids.tolist() == [-1, -1] and frames["b"].track_ids.tolist() == [7, 9]
+    np.testing.assert_array_equal(frames["a"].polylines[1], [[4, 5], [6, 7]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "not valid JSON"),
+        ("[]", "no object 'results'"),
+        ('{"results": {"t": {"vectors": [], "scores": []}}}', "frame t: labels missing"),
+        ('{"results": {"t": {"vectors": [], "scores": [1], "labels": []}}}', "0 vectors, 1 scores"),
+        ('{"results": {"t": {"vectors": [["x"]], "scores": [1], "labels": [0]}}}', "frame t: vectors"),
+    ],
+)
+def test_a_broken_submission_is_named(tmp_path, content, message):
+    path = tmp_path / "submission.json"
+    path.write_text(content)
+    with pytest.raises(UserError, match=message):
+        read_submission(path)
