@@ -1,0 +1,108 @@
+"""A training run on disk: tensors in safetensors, everything else in JSON, replaced in one step."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import orjson
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from predmapnet.errors import UserError
+
+PREFIX = "step-"
+
+
+def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Name the optimiser's tensors by group, parameter and slot."""
+    return {
+        f"{group}.{index}.{slot}": value
+        for group, parameters in enumerate(optimiser.param_groups)
+        for index, parameter in enumerate(parameters["params"])
+        for slot, value in optimiser.state.get(parameter, {}).items()
+    }
+
+
+def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Put back what :func:`optimiser_tensors` named."""
+    for name, value in tensors.items():
+        group, index, slot = name.split(".")
+        parameter = optimiser.param_groups[int(group)]["params"][int(index)]
+        optimiser.state[parameter][slot] = value.clone()
+
+
+def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Put ``prefix.`` before every name."""
+    return {f"{prefix}.{name}": value for name, value in tensors.items()}
+
+
+def below_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose name starts with ``prefix.``, without it."""
+    return {name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")}
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write a safetensors file; tensors that share memory are written apart."""
+    save_file({name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, path)
+
+
+def partial_folder(folder: Path, order: int) -> Path:
+    """Name of the folder in which the parts of a checkpoint are gathered; later ones have a larger ``order``."""
+    return folder / f".{PREFIX}{order:09d}.partial"
+
+
+def prepare(folder: Path, order: int) -> None:
+    """Make that folder, empty."""
+    partial = partial_folder(folder, order)
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+
+
+def publish(partial: Path) -> Path:
+    """Give a gathered checkpoint its name, then delete the older ones."""
+    target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
+    shutil.rmtree(target, ignore_errors=True)
+    partial.rename(target)
+    for older in partial.parent.glob(f"{PREFIX}*"):
+        if older != target:
+            shutil.rmtree(older)
+    return target
+
+
+def latest(folder: Path) -> Path | None:
+    """Return the newest complete checkpoint below ``folder``, or None."""
+    return max(folder.glob(f"{PREFIX}*"), default=None)
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write JSON, readable by a person."""
+    path.write_bytes(orjson.dumps(value, option=orjson.OPT_INDENT_2))
+
+
+def read(checkpoint: Path, part: str) -> dict[str, Tensor]:
+    """Read one part (``network``, ``streams-0``) of a checkpoint. Raises UserError if it is damaged."""
+    try:
+        return load_file(checkpoint / f"{part}.safetensors")
+    except Exception as error:
+        raise UserError(f"The checkpoint {checkpoint} is damaged: {part} cannot be read ({error}).") from None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object. Raises UserError if it is damaged."""
+    try:
+        value: dict[str, Any] = orjson.loads(path.read_bytes())
+    except (OSError, orjson.JSONDecodeError) as error:
+        raise UserError(f"{path} cannot be read: {error}.") from None
+    return value
+
+
+def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
+    """Load a state dict; a mismatch (another preset or version) is the user's error."""
+    try:
+        network.load_state_dict(dict(tensors))
+    except RuntimeError as error:
+        raise UserError(f"The weights in {where} do not fit this network: {error}") from None

@@ -1,0 +1,78 @@
+"""AdamW with a schedule over a budget, and the moving average of the weights that is shipped."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """What drives the weights; the defaults are those of the two-core findings."""
+
+    learning_rate: float = 1e-3
+    betas: tuple[float, float] = (0.9, 0.98)
+    weight_decay: float = 0.02
+    warmup_steps: int = 150
+    clip_norm: float = 10.0
+    average_decay: float = 0.998
+    final_fraction: float = 0.02
+
+
+def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.optim.AdamW:
+    """AdamW over the trainable parameters; norms, biases and embeddings of one row are not decayed."""
+    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    groups = [
+        {"params": [p for p in parameters if p.ndim >= 2], "weight_decay": settings.weight_decay},
+        {"params": [p for p in parameters if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas)
+
+
+def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> float:
+    """Warm up over steps, then fall along a cosine over the budget.
+
+    Args:
+        step: optimiser steps of this stage so far.
+        progress: part of the stage's budget (time or steps) that is used up, in [0, 1].
+        settings: peak and warm-up.
+    """
+    warmup = min(1.0, (step + 1) / settings.warmup_steps)
+    cosine = 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
+    return settings.learning_rate * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
+
+
+class WeightAverage:
+    """Exponential moving average of a network's parameters and buffers.
+
+    The decay starts low, ``(1 + updates) / (10 + updates)``, so that the average soon forgets the random start.
+
+    Attributes:
+        network: a copy of the network that holds the average.
+        updates: how often it was updated.
+    """
+
+    def __init__(self, network: nn.Module, decay: float) -> None:
+        self.network = copy.deepcopy(network).eval().requires_grad_(False)
+        self.decay = decay
+        self.updates = 0
+
+    @torch.no_grad()
+    def update(self, network: nn.Module) -> None:
+        """Move the average towards ``network``; integer buffers are copied."""
+        decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
+        self.updates += 1
+        average, current = _floats(self.network), _floats(network)
+        torch._foreach_lerp_(average, current, 1 - decay)
+        for kept, value in zip(self.network.buffers(), network.buffers(), strict=True):
+            if not kept.is_floating_point():
+                kept.copy_(value)
+
+
+def _floats(network: nn.Module) -> list[Tensor]:
+    tensors = [*network.parameters(), *network.buffers()]
+    return [tensor.detach() for tensor in tensors if tensor.is_floating_point()]

@@ -1,0 +1,72 @@
+"""The single-frame stage: independent frames, no memory; teaches the network to see."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.network.image_input import normalise_images
+from predmapnet.network.interface import FrameInputs
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.view_transform import RigLookup
+from predmapnet.training.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.losses import frame_losses
+from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.workers import Workers
+
+
+def frame_inputs(batch: Batch, config: PredMapNetConfig) -> FrameInputs:
+    """Turn a batch of stored frames into what the network takes."""
+    return FrameInputs(normalise_images(batch.images, config.image), batch.camera_valid, batch.ego_to_global)
+
+
+def roi_size(config: PredMapNetConfig) -> Tensor:
+    """Length and width of the ROI, ``(2,)``, metres."""
+    return torch.tensor([config.roi_length, config.roi_width])
+
+
+class SingleFrameStage:
+    """Losses of random frames.
+
+    Attributes:
+        name: of the stage.
+        frames_per_step: frames that this process sees in one step.
+    """
+
+    name = "single"
+
+    def __init__(
+        self,
+        network: PredMapNet,
+        lookup: RigLookup,
+        scenes: TrainingScenes,
+        settings: TrainingSettings,
+        workers: Workers,
+    ) -> None:
+        self.frames_per_step = max(1, settings.batch // workers.size)
+        self._network = network
+        self._lookup = lookup
+        self._settings = settings
+        self._size = roi_size(network.config)
+        self.make_batch = SingleFrameBatches(
+            scenes,
+            self.frames_per_step,
+            network.config.roi,
+            network.config.decoder.points,
+            settings.augmentation,
+            (settings.seed, workers.rank),
+        )
+
+    def losses(self, step: int, batch: Batch) -> dict[str, Tensor]:
+        """Return the weighted losses of one batch."""
+        outputs = self._network(frame_inputs(batch, self._network.config), self._lookup, None)
+        settings = self._settings
+        return frame_losses(outputs, batch.targets, self._size, settings.weights, settings.costs).terms
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing is carried from step to step."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing to restore."""
