@@ -1,0 +1,124 @@
+"""From fused curves and grids to the elements of the map: what has evidence, smoothed, simplified, without knots."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.special import expit
+
+from mapfusion.config import IntegratorConfig
+from mapfusion.elements import ElementKind, MapElement
+from mapfusion.geometry import arc_length
+from mapfusion.lines import Curve, Evidence, FusedLine
+from mapfusion.rings import FusedRing
+from mapfusion.views import ViewGrid
+
+Float = NDArray[np.float64]
+
+LOG_ODDS_LIMIT = 6.0
+"""More evidence than this does not make a map surer."""
+
+
+def log_odds(seen: Float, missed: Float, config: IntegratorConfig) -> Float:
+    """Return the log-odds that something exists, from sums of sightings and of missed sightings."""
+    odds = config.prior_log_odds + config.hit_log_odds * seen - config.miss_log_odds * missed
+    return np.clip(odds, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
+
+
+def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
+    """Return the stretches of a line that have evidence enough, as elements."""
+    curve = line.curve
+    if line.evidence.observations < config.min_observations:
+        return []
+    missed = np.maximum(views.at(curve.points) - curve.seen_view, 0.0)
+    odds = log_odds(curve.seen, missed, config)
+    points = smooth(curve, config)
+    elements = []
+    for start, stop in _stretches(odds > 0.0, int(config.max_gap / config.station_spacing)):
+        if stop - start < 2 or arc_length(points[start:stop])[-1] < config.min_length:
+            continue
+        part, kept = _simplify(points[start:stop], config.simplify_tolerance)
+        deviation = 1.0 / np.sqrt(curve.information[start:stop][kept])
+        elements.append(_element(line.kind, part, float(expit(odds[start:stop]).mean()), line.evidence, deviation))
+    return elements
+
+
+def ring_elements(ring: FusedRing, views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
+    """Return a crossing as an element, or nothing where the evidence is too little."""
+    if ring.evidence.observations < config.min_observations:
+        return []
+    held = np.argwhere(ring.share > 0.5)
+    if not len(held):
+        return []
+    held = held[:: max(len(held) // 64, 1)]
+    seen_view = ring.seen_view[held[:, 0], held[:, 1]]
+    missed: Float = np.maximum(
+        views.at(np.asarray((held + ring.corner + 0.5) * config.ring_cell, dtype=np.float64)) - seen_view, 0.0
+    )
+    odds = log_odds(np.array([ring.seen]), np.array([np.median(missed)]), config)[0]
+    outlines = ring.outlines(config.ring_cell)
+    if odds <= 0.0 or not outlines or outlines[0].area < 1.0:
+        return []
+    outline = shapely.simplify(outlines[0], config.simplify_tolerance)
+    points = shapely.get_coordinates(shapely.orient_polygons(outline))
+    return [_element(ring.kind, points, float(expit(odds)), ring.evidence, None)]
+
+
+def smooth(curve: Curve, config: IntegratorConfig) -> Float:
+    """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information).
+
+    Minimises ``sum information |z - p|² + sum |second difference of z|² / curvature_deviation²``.
+
+    Returns:
+        ``(n, 2) float64``.
+    """
+    count = len(curve)
+    if count < 3:
+        return curve.points
+    stiffness = 1.0 / config.curvature_deviation**2
+    bands = np.zeros((3, count))
+    bands[2] = curve.information
+    bands[2, :-2] += stiffness
+    bands[2, 1:-1] += 4.0 * stiffness
+    bands[2, 2:] += stiffness
+    bands[1, 1:-1] -= 2.0 * stiffness
+    bands[1, 2:] -= 2.0 * stiffness
+    bands[0, 2:] += stiffness
+    origin = curve.points[0]
+    solved = solveh_banded(bands, curve.information[:, None] * (curve.points - origin))
+    return np.asarray(solved + origin, dtype=np.float64)
+
+
+def _stretches(alive: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
+    """Return start and stop (excluded) of the runs of True, with gaps of up to ``gap`` bridged."""
+    rows = np.flatnonzero(alive)
+    if not len(rows):
+        return []
+    breaks = np.flatnonzero(np.diff(rows) > gap + 1)
+    starts = rows[np.concatenate([[0], breaks + 1])]
+    stops = rows[np.concatenate([breaks, [len(rows) - 1]])] + 1
+    return list(zip(starts.tolist(), stops.tolist(), strict=True))
+
+
+def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]]:
+    """Simplify a line; returns its points and which of the given ones they are."""
+    simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), tolerance))
+    lookup = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
+    return simple, np.array([lookup[point] for point in map(tuple, simple.tolist())])
+
+
+def _element(
+    kind: ElementKind, points: Float, confidence: float, evidence: Evidence, deviation: Float | None
+) -> MapElement:
+    return MapElement(
+        kind=kind,
+        points=points,
+        confidence=confidence,
+        observations=evidence.observations,
+        first_seen=evidence.first_seen,
+        last_seen=evidence.last_seen,
+        track_ids=tuple(sorted(evidence.tracks)),
+        deviation=deviation,
+    )

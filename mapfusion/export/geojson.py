@@ -1,0 +1,225 @@
+"""RFC 7946 GeoJSON: one feature per element, WGS84, with the provenance of the file in ``predmapnet``."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import secrets
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import ElementKind, GlobalMap, MapElement
+
+Float = NDArray[np.float64]
+
+DECIMALS = 10
+"""Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+WGS84_SEMI_MAJOR_AXIS = 6_378_137.0
+WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
+
+
+class Georeference(Protocol):
+    """From the metric global frame to WGS84."""
+
+    name: str
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        ...
+
+
+class InvertibleGeoreference(Georeference, Protocol):
+    """A georeference that also leads back."""
+
+    def from_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""
+        ...
+
+
+def write_geojson(
+    global_map: GlobalMap,
+    path: Path,
+    georeference: Georeference,
+    provenance: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a map; the file appears complete or not at all, and is the same every time but for ``created``.
+
+    Lines become LineStrings, crossings Polygons with counter-clockwise rings. Timestamps are ISO 8601 UTC with nine
+    digits after the second, because integers of nanoseconds exceed what JSON readers keep exactly (2**53).
+
+    Args:
+        global_map: elements in the metric global frame.
+        path: file to write; an existing one is replaced.
+        georeference: of that global frame.
+        provenance: what else the file should tell of its origin, beside ``global_map.provenance``.
+
+    Raises:
+        ValueError: coordinates that are not finite or not on the globe.
+        OSError: the file cannot be written; a file that was there before is left as it was.
+    """
+    features = [_feature(element, georeference) for element in global_map]
+    document: dict[str, Any] = {"type": "FeatureCollection"}
+    if features:
+        document["bbox"] = _bounding_box(features)
+    document["predmapnet"] = {
+        **global_map.provenance,
+        **(provenance or {}),
+        "georeference": georeference.name,
+        "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+    }
+    lines = [json.dumps(feature, separators=(",", ":"), allow_nan=False) for feature in features]
+    head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
+    body = "[\n" + ",\n".join(lines) + "\n]" if lines else "[]"
+    _write_atomically(path, f'{head},"features":{body}}}\n')
+
+
+def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
+    """Read a map that :func:`write_geojson` wrote.
+
+    Args:
+        path: the file.
+        georeference: leads back to the metric global frame; without one, the map is in metres east and north of
+            the middle of the file's bounding box.
+
+    Returns:
+        The map; ``provenance`` is the file's ``predmapnet`` member.
+
+    Raises:
+        ValueError: not a file of ours; says where it breaks.
+        OSError: the file cannot be read.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not JSON: {error}") from error
+    if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
+        raise ValueError(f"{path}: not a GeoJSON FeatureCollection")
+    if georeference is None:
+        box = document.get("bbox", [0.0, 0.0, 0.0, 0.0])
+        georeference = _LocalPlane((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+    elements = []
+    for position, feature in enumerate(document.get("features", [])):
+        try:
+            elements.append(_element(feature, georeference))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"{path}: feature {position} is not an element of a map: {error!r}") from error
+    return GlobalMap(tuple(elements), document.get("predmapnet", {}))
+
+
+def format_timestamp(nanoseconds: int) -> str:
+    """Return ISO 8601 UTC with nine digits: ``format_timestamp(1)`` is ``1970-01-01T00:00:00.000000001Z``."""
+    seconds, rest = divmod(int(nanoseconds), 1_000_000_000)
+    return (EPOCH + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest:09d}Z"
+
+
+def parse_timestamp(text: str) -> int:
+    """Return the nanoseconds of a text that :func:`format_timestamp` made; raises ValueError for others."""
+    match = re.fullmatch(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)\.(\d{9})Z", text)
+    if match is None:
+        raise ValueError(f"not a timestamp of the form 2024-01-31T12:00:00.123456789Z: {text!r}")
+    moment = datetime.strptime(match[1] + "+0000", "%Y-%m-%dT%H:%M:%S%z") - EPOCH
+    return (moment.days * 86_400 + moment.seconds) * 1_000_000_000 + int(match[2])
+
+
+class _LocalPlane:
+    """Metres east and north of a point, on the ellipsoid's radii of curvature there."""
+
+    name = "local plane"
+
+    def __init__(self, longitude: float, latitude: float) -> None:
+        self.origin = np.array([longitude, latitude])
+        sine = math.sin(math.radians(latitude))
+        root = math.sqrt(1.0 - WGS84_ECCENTRICITY_SQUARED * sine**2)
+        meridian = WGS84_SEMI_MAJOR_AXIS * (1.0 - WGS84_ECCENTRICITY_SQUARED) / root**3
+        parallel = WGS84_SEMI_MAJOR_AXIS / root * math.cos(math.radians(latitude))
+        self.scale = np.radians(np.array([parallel, meridian]))
+
+    def to_wgs84(self, points: Float) -> Float:
+        return np.asarray(points / self.scale + self.origin)
+
+    def from_wgs84(self, points: Float) -> Float:
+        return np.asarray((points - self.origin) * self.scale)
+
+
+def _feature(element: MapElement, georeference: Georeference) -> dict[str, Any]:
+    degrees = np.round(georeference.to_wgs84(element.points), DECIMALS)
+    if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
+        raise ValueError(f"a {element.kind.label} lies outside the globe: the georeference does not fit the map")
+    deviation = element.deviation
+    if element.kind.is_ring:
+        degrees[-1] = degrees[0]
+        x, y = (degrees - degrees[0]).T
+        if float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0:
+            degrees = degrees[::-1]
+            deviation = None if deviation is None else deviation[::-1]
+    geometry = (
+        {"type": "Polygon", "coordinates": [degrees.tolist()]}
+        if element.kind.is_ring
+        else {"type": "LineString", "coordinates": degrees.tolist()}
+    )
+    properties: dict[str, Any] = {
+        "kind": element.kind.label,
+        "confidence": round(element.confidence, 4),
+        "observations": element.observations,
+        "first_seen": format_timestamp(element.first_seen),
+        "last_seen": format_timestamp(element.last_seen),
+        "track_ids": list(element.track_ids),
+        "length_m": round(element.length, 3),
+    }
+    if deviation is not None:
+        properties["deviation_m"] = np.round(deviation, 3).tolist()
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _element(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -> MapElement:
+    properties, geometry = feature["properties"], feature["geometry"]
+    kind = ElementKind[properties["kind"].upper()]
+    expected = "Polygon" if kind.is_ring else "LineString"
+    if geometry["type"] != expected:
+        raise ValueError(f"a {kind.label} must be a {expected}, not a {geometry['type']}")
+    degrees = np.array(geometry["coordinates"][0] if kind.is_ring else geometry["coordinates"], dtype=np.float64)
+    deviation = properties.get("deviation_m")
+    return MapElement(
+        kind=kind,
+        points=georeference.from_wgs84(degrees),
+        confidence=float(properties["confidence"]),
+        observations=int(properties["observations"]),
+        first_seen=parse_timestamp(properties["first_seen"]),
+        last_seen=parse_timestamp(properties["last_seen"]),
+        track_ids=tuple(int(track) for track in properties["track_ids"]),
+        deviation=None if deviation is None else np.array(deviation, dtype=np.float64),
+    )
+
+
+def _bounding_box(features: list[dict[str, Any]]) -> list[float]:
+    points = np.concatenate(
+        [
+            np.array(
+                f["geometry"]["coordinates"][0] if f["geometry"]["type"] == "Polygon" else f["geometry"]["coordinates"]
+            )
+            for f in features
+        ]
+    )
+    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,259 @@
+"""The map integrator: tracked polylines of single frames in, one global map with evidence out."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.association import Candidate, assign, candidates, gather
+from mapfusion.cleaning import line_elements, ring_elements
+from mapfusion.config import IntegratorConfig
+from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
+from mapfusion.journal import Journal
+from mapfusion.lines import Curve, Evidence, FusedLine, beside, fuse
+from mapfusion.matching import Correspondence
+from mapfusion.observations import Observation, observe, pose_problem
+from mapfusion.rings import FusedRing, RingSighting, common_share, fuse_ring, merge_rings, new_ring, sight
+from mapfusion.spatial import TileIndex
+from mapfusion.views import ViewGrid
+
+Float = NDArray[np.float64]
+
+
+class MapIntegrator:
+    """Fuses the maps of single frames into one global map.
+
+    Frames may come in any order and from several logs. What a frame costs depends on what lies around the car,
+    not on the size of the map.
+
+    Attributes:
+        config: assumptions about the detector.
+        rejections: what was left out and why, counted by reason.
+
+    Example:
+        >>> integrator = MapIntegrator()
+        >>> len(integrator.map())
+        0
+    """
+
+    def __init__(self, config: IntegratorConfig | None = None) -> None:
+        self.config = config or IntegratorConfig()
+        self.rejections: Counter[str] = Counter()
+        self.journal = Journal()
+        self.views = ViewGrid(self.config)
+        self.lines: dict[int, FusedLine] = {}
+        self.rings: dict[int, FusedRing] = {}
+        self.index = TileIndex()
+        self.next_id = 0
+        self._clean: dict[int, list[MapElement]] = {}
+        self._dirty: set[int] = set()
+
+    def add(self, frame_map: FrameMap, log: str = "") -> None:
+        """Fuse the tracked elements of one frame.
+
+        Broken input (poses, points, scores) is counted in :attr:`rejections` and changes nothing else. A frame of
+        the same log and timestamp as an earlier one adds no evidence and is left out, too.
+
+        Args:
+            frame_map: what the mapper saw.
+            log: name of the drive; poses are checked against other frames of the same drive only.
+        """
+        problem = pose_problem(frame_map.ego_to_global) or self.journal.enter(
+            log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed
+        )
+        if problem is not None:
+            self.rejections[problem] += 1
+            return
+        lines, rings = observe(frame_map, self.config, self.rejections)
+        self.views.add(frame_map.ego_to_global, frame_map.roi)
+        reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + 2.0
+        low, high = frame_map.ego_to_global[:2, 3] - reach, frame_map.ego_to_global[:2, 3] + reach
+        near = self.index.near(low, high)
+        self._dirty.update(near)
+        for kind in (ElementKind.DIVIDER, ElementKind.BOUNDARY):
+            known = {i: self.lines[i] for i in near if i in self.lines and self.lines[i].kind is kind}
+            self._add_lines([o for o in lines if o.kind is kind], known, low, high, frame_map.timestamp)
+        self._add_rings(rings, [i for i in near if i in self.rings], frame_map)
+
+    def map(self) -> GlobalMap:
+        """Return the map as it stands; only what changed since the last call is computed."""
+        for element in self._dirty:
+            if element in self.lines:
+                self._clean[element] = line_elements(self.lines[element], self.views, self.config)
+            elif element in self.rings:
+                self._clean[element] = ring_elements(self.rings[element], self.views, self.config)
+            else:
+                self._clean.pop(element, None)
+        self._dirty.clear()
+        elements = (element for key in sorted(self._clean) for element in self._clean[key])
+        return GlobalMap(tuple(elements))
+
+    def _add_lines(
+        self, observations: list[Observation], known: dict[int, FusedLine], low: Float, high: Float, timestamp: int
+    ) -> None:
+        if not observations:
+            return
+        local = gather(known, low, high)
+        options: list[list[Candidate]] = [
+            candidates(observation, known, local, low, self.config) if local is not None else []
+            for observation in observations
+        ]
+        chosen = assign([{c.element: c.benefit for c in row} for row in options])
+        taken: dict[int, set[int]] = {}
+        leftovers: list[tuple[Observation, Curve]] = []
+        touched: set[int] = set()
+        merges: list[tuple[int, int]] = []
+        order = sorted(range(len(observations)), key=lambda i: chosen[i] is None)
+        for i in order:
+            own = [c for c in options[i] if c.element == chosen[i]]
+            if not own:
+                own = [c for c in options[i] if _mostly_free(c, taken)][:1]
+            if not own:
+                leftovers.append((observations[i], _curve(observations[i])))
+                continue
+            candidate = own[0]
+            for other in options[i]:
+                if other.element == candidate.element:
+                    continue
+                if other.element in chosen and not _mostly_free(other, taken):
+                    _note_beside(self.lines, candidate.element, other.element)
+                else:
+                    merges.append((candidate.element, other.element))
+            taken.setdefault(candidate.element, set()).update(candidate.match.station.tolist())
+            if candidate.element in touched:
+                # the stations have moved since; match again
+                match = beside(
+                    self.lines[candidate.element].curve,
+                    _curve(observations[i]),
+                    1.5 * self.config.match_distance,
+                    self.config.match_angle,
+                )
+                if not len(match.station):
+                    continue
+            else:
+                match = candidate.match
+            pieces = self._fuse_line(candidate.element, observations[i], match, timestamp, candidate.element in touched)
+            touched.add(candidate.element)
+            leftovers.extend((observations[i], piece) for piece in pieces)
+        for observation, piece in leftovers:
+            if len(piece) >= 3:
+                self._new_line(observation, piece, timestamp)
+        for first, second in merges:
+            self._merge_lines(first, second)
+
+    def _fuse_line(
+        self, element: int, observation: Observation, match: Correspondence, timestamp: int, again: bool
+    ) -> list[Curve]:
+        line = self.lines[element]
+        line.curve, pieces = fuse(line.curve, _curve(observation), match)
+        evidence = line.evidence
+        evidence.first_seen = min(evidence.first_seen, timestamp)
+        evidence.last_seen = max(evidence.last_seen, timestamp)
+        evidence.observations += not again
+        evidence.tracks[observation.track_id] = evidence.tracks.get(observation.track_id, 0) + 1
+        self.index.put(element, line.curve.points)
+        self._dirty.add(element)
+        return pieces
+
+    def _new_line(self, observation: Observation, curve: Curve, timestamp: int) -> None:
+        evidence = Evidence(timestamp, timestamp, tracks={observation.track_id: 1})
+        self.lines[self.next_id] = FusedLine(observation.kind, curve, evidence)
+        self.index.put(self.next_id, curve.points)
+        self._dirty.add(self.next_id)
+        self.next_id += 1
+
+    def _merge_lines(self, first: int, second: int) -> None:
+        """Make one line of two, unless single frames have shown both side by side."""
+        if first == second or first not in self.lines or second not in self.lines:
+            return
+        keep, drop = min(first, second), max(first, second)
+        base, other = self.lines[keep], self.lines[drop]
+        fewer = min(base.evidence.observations, other.evidence.observations)
+        if base.evidence.beside.get(drop, 0) > 0.25 * fewer:
+            return
+        match = beside(base.curve, other.curve, self.config.match_distance, self.config.match_angle)
+        if len(match.station) < 2 or match.distance.mean() > self.config.merge_distance:
+            return
+        base.curve, pieces = fuse(base.curve, other.curve, match)
+        base.evidence.absorb(other.evidence)
+        self._dirty.update((keep, drop))
+        self.index.put(keep, base.curve.points)
+        self.index.remove(drop)
+        del self.lines[drop]
+        for piece in pieces:
+            if len(piece) >= 3:
+                evidence = Evidence(
+                    other.evidence.first_seen,
+                    other.evidence.last_seen,
+                    other.evidence.observations,
+                    dict(other.evidence.tracks),
+                )
+                self.lines[self.next_id] = FusedLine(other.kind, piece, evidence)
+                self.index.put(self.next_id, piece.points)
+                self._dirty.add(self.next_id)
+                self.next_id += 1
+
+    def _add_rings(self, observations: list[Observation], near: list[int], frame_map: FrameMap) -> None:
+        options: list[dict[int, tuple[float, RingSighting]]] = []
+        cell = self.config.ring_cell
+        for observation in observations:
+            row: dict[int, tuple[float, RingSighting]] = {}
+            for element in near:
+                ring = self.rings[element]
+                box_low, box_high = ring.corner * cell, ring.stop * cell
+                if (observation.points.max(axis=0) < box_low).any() or (
+                    observation.points.min(axis=0) > box_high
+                ).any():
+                    continue
+                sighting = sight(observation, (ring.corner, ring.stop), frame_map.ego_to_global, frame_map.roi, cell)
+                common = common_share(ring, sighting)
+                if common > self.config.ring_overlap:
+                    row[element] = (common, sighting)
+            options.append(row)
+        chosen = assign([{element: common for element, (common, _) in row.items()} for row in options])
+        for observation, row, match in zip(observations, options, chosen, strict=True):
+            if match is None:
+                sighting = sight(observation, None, frame_map.ego_to_global, frame_map.roi, cell)
+                self.rings[self.next_id] = new_ring(sighting, frame_map.timestamp)
+                self._file_ring(self.next_id)
+                self.next_id += 1
+                continue
+            element = match
+            ring = self.rings[element]
+            fuse_ring(ring, row[element][1])
+            evidence = ring.evidence
+            evidence.first_seen = min(evidence.first_seen, frame_map.timestamp)
+            evidence.last_seen = max(evidence.last_seen, frame_map.timestamp)
+            evidence.observations += 1
+            evidence.tracks[observation.track_id] = evidence.tracks.get(observation.track_id, 0) + 1
+            self._file_ring(element)
+            for other, (common, _) in row.items():
+                if other != element and other not in chosen and common > 0.5 and other in self.rings:
+                    merge_rings(ring, self.rings.pop(other))
+                    self.index.remove(other)
+                    self._dirty.add(other)
+                    self._file_ring(element)
+
+    def _file_ring(self, element: int) -> None:
+        ring = self.rings[element]
+        corners = np.array([ring.corner, ring.stop, [ring.corner[0], ring.stop[1]], [ring.stop[0], ring.corner[1]]])
+        self.index.put(element, np.vstack([corners, corners.mean(axis=0)]) * self.config.ring_cell)
+        self._dirty.add(element)
+
+
+def _curve(observation: Observation) -> Curve:
+    count = len(observation.points)
+    return Curve(observation.points, observation.information, np.full(count, observation.sighting), observation.view)
+
+
+def _mostly_free(candidate: Candidate, taken: dict[int, set[int]]) -> bool:
+    stations = taken.get(candidate.element)
+    return stations is None or len(stations.intersection(candidate.match.station.tolist())) < 0.3 * candidate.overlap
+
+
+def _note_beside(lines: dict[int, FusedLine], first: int, second: int) -> None:
+    for one, other in ((first, second), (second, first)):
+        counts = lines[one].evidence.beside
+        counts[other] = counts.get(other, 0) + 1

@@ -1,0 +1,75 @@
+"""Which stretch of one curve lies beside which stretch of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """Stations of a map beside a curve.
+
+    Attributes:
+        station: ``(n,) int64``, rows of the stations that were compared.
+        vertex: ``(n,) int64``, the nearest vertex of the curve.
+        offset: ``(n, 2) float64``, metres, from the station to its foot on the curve.
+        distance: ``(n,) float64``, length of the offset, metres.
+        same_way: ``(n,) bool``, whether both run in the same direction.
+    """
+
+    station: Integer
+    vertex: Integer
+    offset: Float
+    distance: Float
+    same_way: NDArray[np.bool_]
+
+
+def tangents(points: Float) -> Float:
+    """Return unit directions ``(n, 2)`` at the vertices of a line ``(n, 2)``, from its neighbours."""
+    step = np.empty_like(points)
+    step[1:-1] = points[2:] - points[:-2]
+    step[0] = points[1] - points[0]
+    step[-1] = points[-1] - points[-2]
+    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
+    return step / np.maximum(length, 1e-9)[:, None]
+
+
+def correspond(
+    stations: Float, directions: Float, curve: Float, curve_tangents: Float, reach: float, angle: float, end: float
+) -> Correspondence:
+    """Find the stations that lie beside a curve and run along it, either way.
+
+    Args:
+        stations: ``(n, 2)``, metres, near the origin of coordinates (squares of large ones lose digits).
+        directions: ``(n, 2)``, unit.
+        curve: ``(m, 2)``, metres, vertices at equal distances.
+        curve_tangents: ``(m, 2)``, unit.
+        reach: largest lateral distance, metres.
+        angle: largest angle between the directions, degrees.
+        end: how far past the first or last vertex a foot may lie, metres.
+
+    Returns:
+        The stations that match, in their order.
+    """
+    low, high = curve.min(axis=0) - reach, curve.max(axis=0) + reach
+    near = np.flatnonzero(
+        (stations[:, 0] > low[0]) & (stations[:, 0] < high[0]) & (stations[:, 1] > low[1]) & (stations[:, 1] < high[1])
+    )
+    points = stations[near]
+    # |p - q|² without |p|², which does not change which q is nearest
+    vertex = np.argmin((curve**2).sum(axis=1)[None, :] - 2.0 * (points @ curve.T), axis=1)
+    tangent = curve_tangents[vertex]
+    gap = curve[vertex] - points
+    along = (gap * tangent).sum(axis=1)
+    offset = gap - along[:, None] * tangent
+    distance = np.sqrt((offset**2).sum(axis=1))
+    cosine = (directions[near] * tangent).sum(axis=1)
+    past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
+    keep = (distance < reach) & (np.abs(cosine) > np.cos(np.radians(angle))) & ~past & (np.abs(along) < reach)
+    return Correspondence(near[keep], vertex[keep], offset[keep], distance[keep], cosine[keep] > 0)

@@ -1,0 +1,158 @@
+"""From the polylines of one frame to observations in the global frame; what is broken is named and left out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from mapfusion.config import IntegratorConfig
+from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
+from mapfusion.geometry import arc_length, transform_points
+from mapfusion.views import view_weight
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One detected line or ring, in the global frame.
+
+    Attributes:
+        kind: what it is.
+        track_id: of its log.
+        score: in ``[0, 1]``.
+        points: ``(n, 2) float64``, metres, global frame; lines have vertices one station apart.
+        information: ``(n,) float64``, inverse variance across the line, 1 / m².
+        view: ``(n,) float64``, view weight at each vertex.
+    """
+
+    kind: ElementKind
+    track_id: int
+    score: float
+    points: Float
+    information: Float
+    view: Float
+
+    @property
+    def sighting(self) -> float:
+        """What the sighting counts for: 1 at score 0.5, between 0.5 and 1.5."""
+        return float(np.clip(2.0 * self.score, 0.5, 1.5))
+
+    def part(self, start: int, stop: int) -> Observation:
+        """Return the observation of vertices ``start`` to ``stop`` (excluded)."""
+        piece = slice(start, stop)
+        return Observation(
+            self.kind, self.track_id, self.score, self.points[piece], self.information[piece], self.view[piece]
+        )
+
+
+def pose_problem(ego_to_global: Float) -> str | None:
+    """Say what is wrong with a pose, or None: it must be ``(4, 4)``, finite and rigid."""
+    pose = np.asarray(ego_to_global)
+    if pose.shape != (4, 4):
+        return "pose is not 4 x 4"
+    if not np.isfinite(pose).all():
+        return "pose is not finite"
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        return "pose is not rigid"
+    return None
+
+
+def observe(
+    frame_map: FrameMap, config: IntegratorConfig, rejections: Counter[str]
+) -> tuple[list[Observation], list[Observation]]:
+    """Return the lines and the rings of a frame that can be fused.
+
+    Args:
+        frame_map: one instant; only tracked elements are used.
+        config: spacing and error model.
+        rejections: counted up by reason for every element that is left out.
+
+    Returns:
+        Lines (clipped to the ROI, resampled) and rings.
+    """
+    lines: list[Observation] = []
+    rings: list[Observation] = []
+    box = shapely.box(*(-frame_map.roi.size / 2), *(frame_map.roi.size / 2))
+    shapely.prepare(box)
+    for row in np.flatnonzero(frame_map.track_ids >= 0):
+        points = np.asarray(frame_map.polylines[row], dtype=np.float64)
+        problem = _element_problem(points, frame_map.kinds[row], frame_map.scores[row], config)
+        if problem is not None:
+            rejections[problem] += 1
+            continue
+        kind = ElementKind(int(frame_map.kinds[row]))
+        pieces = _ring_pieces(points, box) if kind.is_ring else _line_pieces(points, box, frame_map.roi)
+        if not pieces:
+            rejections["outside the region of interest" if not kind.is_ring else "ring without area"] += 1
+        for piece in pieces:
+            local = piece if kind.is_ring else _stations(piece, config.station_spacing)
+            if local is None:
+                rejections["line without length"] += 1
+                continue
+            deviation = config.deviation_near + config.deviation_per_metre * np.hypot(local[:, 0], local[:, 1])
+            (rings if kind.is_ring else lines).append(
+                Observation(
+                    kind=kind,
+                    track_id=int(frame_map.track_ids[row]),
+                    score=float(frame_map.scores[row]),
+                    points=transform_points(frame_map.ego_to_global, local),
+                    information=max(float(frame_map.scores[row]), 0.05) / deviation**2,
+                    view=view_weight(local, frame_map.roi, config),
+                )
+            )
+    return lines, rings
+
+
+def _element_problem(points: Float, kind: int, score: float, config: IntegratorConfig) -> str | None:
+    if kind not in (0, 1, 2):
+        return "unknown kind"
+    if not (np.isfinite(score) and 0.0 <= score <= 1.0):
+        return "score outside [0, 1]"
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+        return "fewer than two points"
+    if len(points) > config.max_points:
+        return "too many points"
+    if not np.isfinite(points).all():
+        return "points not finite"
+    if not np.ptp(points, axis=0).any():
+        return "line without length"
+    return None
+
+
+def _line_pieces(points: Float, box: shapely.Polygon, roi: RegionOfInterest) -> list[Float]:
+    if (np.abs(points) <= roi.size / 2).all():
+        return [points]
+    inside = shapely.line_merge(shapely.intersection(shapely.LineString(points), box))
+    return [shapely.get_coordinates(part) for part in shapely.get_parts(inside) if part.geom_type == "LineString"]
+
+
+def _ring_pieces(points: Float, box: shapely.Polygon) -> list[Float]:
+    """Clip a ring; one that crosses itself is repaired and its largest part kept."""
+    if len(points) < 3:
+        return []
+    polygon = shapely.Polygon(points)
+    if not polygon.is_valid:
+        polygon = shapely.make_valid(polygon, method="structure", keep_collapsed=False)
+    parts = [
+        part
+        for part in shapely.get_parts(shapely.intersection(polygon, box))
+        if part.geom_type == "Polygon" and part.area > 0.1
+    ]
+    if not parts:
+        return []
+    return [shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)]
+
+
+def _stations(points: Float, spacing: float) -> Float | None:
+    distance = arc_length(points)
+    if distance[-1] < spacing / 2:
+        return None
+    count = max(round(distance[-1] / spacing), 1) + 1
+    at = np.linspace(0.0, distance[-1], count)
+    return np.stack([np.interp(at, distance, points[:, 0]), np.interp(at, distance, points[:, 1])], axis=1)
