@@ -1,0 +1,54 @@
+"""The demo world as a source: procedural towns that make themselves, read like any nuScenes data set."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from predmapnet.datasets.georeference import demo_georeference
+from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
+from predmapnet.datasets.source import Progress, SceneInfo
+from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos
+from predmapnet.errors import UserError
+
+
+class DemoSource:
+    """Scenes of the demo world; each is rendered into the cache when it is first opened.
+
+    Attributes:
+        name: ``demo``.
+        root: the cache folder.
+        synthetic: True.
+    """
+
+    name = "demo"
+    synthetic = True
+
+    def __init__(self, cache: Path | None = None) -> None:
+        """Use a cache folder; None takes the user's own."""
+        self.root = default_cache() if cache is None else Path(cache)
+
+    def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
+        """List the scenes of all towns; ``ready`` says which are rendered already."""
+        return tuple(
+            dataclasses.replace(info, ready=scene_folder(info.name, self.root).is_dir()) for info in scene_infos(split)
+        )
+
+    def open(self, scene: str, progress: Progress | None = None) -> NuScenesScene:
+        """Render a scene if need be, and open it.
+
+        Raises:
+            UserError: a scene that does not exist, or a cache folder that cannot be written to.
+        """
+        folder = ensure_scene(scene, self.root, progress)
+        infos = scene_infos()
+        number = next(number for number, info in enumerate(infos) if info.name == scene)
+        written = NuScenesSource(folder).open(scene)
+        if len(written) != infos[number].frames:
+            raise UserError(
+                f"{folder} holds {len(written)} frames of {scene} instead of {infos[number].frames}. "
+                "The rendering is incomplete: delete this folder and it will be made again."
+            )
+        written.info = dataclasses.replace(infos[number], ready=True)
+        written.georeference = demo_georeference(infos[number].location, number)
+        return written

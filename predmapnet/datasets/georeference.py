@@ -1,0 +1,109 @@
+"""From each data set's metric frame to longitude and latitude (WGS84)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+
+Float = NDArray[np.float64]
+
+NUSCENES_ORIGINS = {
+    "boston-seaport": (42.336849169438615, -71.05785369873047),
+    "singapore-onenorth": (1.2882100868743724, 103.78475189208984),
+    "singapore-hollandvillage": (1.2993652317780957, 103.78217697143555),
+    "singapore-queenstown": (1.2782562240223188, 103.76741409301758),
+}
+"""Latitude and longitude of the maps' lower left corners, from the nuScenes devkit's pose export."""
+
+ARGOVERSE2_CITIES = {
+    "ATX": (30.27464237939507, -97.7404457407424, 14),
+    "DTW": (42.29993066912924, -83.17555750783717, 17),
+    "MIA": (25.77452579915163, -80.19656914449405, 17),
+    "PAO": (37.416065, -122.13571963362166, 10),
+    "PIT": (40.44177902989321, -80.01294377242584, 17),
+    "WDC": (38.889377, -77.0355047439081, 18),
+}
+"""Latitude, longitude and UTM zone (north) of the city frames' origins, from the av2 package."""
+
+POINT_NEMO = (-48.8767, -123.3933)
+"""Latitude and longitude of the point of the ocean farthest from any land: home of the demo world."""
+
+
+@dataclass(frozen=True)
+class SphereGeoreference:
+    """Bearing and distance from an origin on a sphere of the equatorial radius, as the nuScenes devkit exports.
+
+    Attributes:
+        name: of the map.
+        latitude, longitude: of the frame's origin, degrees.
+    """
+
+    name: str
+    latitude: float
+    longitude: float
+    radius: float = 6378137.0
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres (x east, y north) to ``(n, 2)`` longitude and latitude, degrees."""
+        latitude = np.radians(self.latitude)
+        bearing = np.arctan2(points[:, 0], points[:, 1])
+        angle = np.hypot(points[:, 0], points[:, 1]) / self.radius
+        there = np.arcsin(np.sin(latitude) * np.cos(angle) + np.cos(latitude) * np.sin(angle) * np.cos(bearing))
+        east = np.arctan2(
+            np.sin(bearing) * np.sin(angle) * np.cos(latitude), np.cos(angle) - np.sin(latitude) * np.sin(there)
+        )
+        longitude = np.radians(self.longitude) + east
+        return np.stack([np.degrees(longitude), np.degrees(there)], axis=1)
+
+
+@dataclass(frozen=True)
+class UtmGeoreference:
+    """A city frame that is UTM shifted to an origin, as Argoverse 2 defines it.
+
+    Attributes:
+        name: of the city.
+        latitude, longitude: of the frame's origin, degrees.
+        zone: UTM zone, northern hemisphere.
+    """
+
+    name: str
+    latitude: float
+    longitude: float
+    zone: int
+
+    @cached_property
+    def _utm(self) -> Transformer:
+        return Transformer.from_crs(CRS.from_epsg(4326), CRS.from_epsg(32600 + self.zone), always_xy=True)
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres, city frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        east, north = self._utm.transform(self.longitude, self.latitude)
+        longitude, latitude = self._utm.transform(points[:, 0] + east, points[:, 1] + north, direction="INVERSE")
+        return np.stack([longitude, latitude], axis=1)
+
+
+def nuscenes_georeference(location: str) -> SphereGeoreference | None:
+    """Return the georeference of a nuScenes map, or None for a map that nuScenes does not know."""
+    origin = NUSCENES_ORIGINS.get(location)
+    return None if origin is None else SphereGeoreference(location, *origin)
+
+
+def argoverse2_georeference(city: str) -> UtmGeoreference | None:
+    """Return the georeference of an Argoverse 2 city (``PIT``), or None for an unknown one."""
+    origin = ARGOVERSE2_CITIES.get(city)
+    return None if origin is None else UtmGeoreference(city, *origin)
+
+
+def demo_georeference(name: str, index: int) -> SphereGeoreference:
+    """Return a place in the South Pacific for a demo town; towns lie on a grid of 0.1 degrees and never overlap.
+
+    Args:
+        name: of the town.
+        index: number of the town in the demo world, from 0.
+    """
+    row, column = divmod(index, 20)
+    return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)

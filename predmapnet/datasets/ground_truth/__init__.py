@@ -1,0 +1,1 @@
+"""Vectorised ground truth exactly as the field's official code forms it, from the data sets' own maps."""

@@ -1,0 +1,277 @@
+"""Ground truth from a nuScenes map expansion (v1.3), frame by frame as the official vector-map code forms it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+from shapely import LineString, Polygon, STRtree
+
+from mapfusion.elements import ElementKind, RegionOfInterest
+from predmapnet.datasets.ground_truth.crossings import merge_crossings
+from predmapnet.datasets.ground_truth.patch import (
+    BORDER,
+    apply,
+    area_rings,
+    crossing_contours,
+    cut_rings,
+    keep_corners,
+    parts_of_type,
+    patch_polygon,
+    rotation_about,
+)
+from predmapnet.datasets.source import FrameTruth
+from predmapnet.demo_world.world import VectorMap
+from predmapnet.errors import UserError
+
+Float = NDArray[np.float64]
+Records = list[dict[str, Any]]
+
+
+class NuScenesGroundTruth:
+    """One map of nuScenes, ready to be asked for the truth around any pose.
+
+    Geometry is indexed once; a frame touches only what lies near it.
+
+    Attributes:
+        dividers: road dividers, then lane dividers, in file order (empty lines stay, for their index).
+        crossings: pieces of pedestrian crossings in file order.
+        road_segments, lanes: drivable surface in file order.
+    """
+
+    def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
+        """Read a map.
+
+        Args:
+            map_file: ``maps/expansion/<location>.json``, or its content.
+
+        Raises:
+            UserError: the file is missing, damaged, or not a map expansion.
+        """
+        content, name = (map_file, "the map") if isinstance(map_file, Mapping) else (_read(map_file), str(map_file))
+        try:
+            nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
+            lines = {line["token"]: line["node_tokens"] for line in content["line"]}
+            polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
+            self._index(
+                dividers=[
+                    LineString([nodes[token] for token in lines[record["line_token"]]])
+                    for layer in ("road_divider", "lane_divider")
+                    for record in content[layer]
+                ],
+                crossings=_polygons(content["ped_crossing"], polygons, nodes),
+                road_segments=_polygons(content["road_segment"], polygons, nodes),
+                lanes=_polygons(content["lane"], polygons, nodes),
+            )
+        except (KeyError, TypeError, shapely.GEOSException, ValueError) as error:
+            raise UserError(
+                f"{name} is not a nuScenes map expansion of version 1.3 ({type(error).__name__}: {error}). "
+                "Fetch the map expansion again and unpack it into maps/expansion."
+            ) from None
+
+    @classmethod
+    def from_vector_map(cls, vector_map: VectorMap) -> NuScenesGroundTruth:
+        """Take a map of the demo world as it is, without files; road dividers come before lane dividers."""
+        truth = cls.__new__(cls)
+        by_direction = sorted(vector_map.dividers, key=lambda divider: not divider.opposite)
+        truth._index(
+            dividers=[LineString(divider.points) for divider in by_direction],
+            crossings=[crossing.polygon for crossing in vector_map.crossings],
+            road_segments=list(vector_map.road_segments),
+            lanes=list(vector_map.lanes),
+        )
+        return truth
+
+    def _index(
+        self,
+        dividers: list[LineString],
+        crossings: list[Polygon],
+        road_segments: list[Polygon],
+        lanes: list[Polygon],
+    ) -> None:
+        self.dividers, self.crossings = dividers, crossings
+        self.road_segments, self.lanes = road_segments, lanes
+        self._layers = {
+            "dividers": _Layer(dividers),
+            "crossings": _Layer(crossings),
+            "road_segments": _Layer(road_segments),
+            "lanes": _Layer(lanes),
+        }
+
+    def frame(self, lidar_to_global: Float, roi: RegionOfInterest) -> FrameTruth:
+        """Return the truth around one lidar pose.
+
+        Args:
+            lidar_to_global: ``(4, 4)``; nuScenes lidar axes (x right, y forward). Only x, y and yaw matter.
+            roi: the region, centred at the lidar.
+
+        Returns:
+            Crossings, dividers, boundaries, in this order; x forward, y left of the lidar. Pieces of the same
+            source element carry the same id.
+        """
+        centre = (float(lidar_to_global[0, 3]), float(lidar_to_global[1, 3]))
+        angle = math.atan2(lidar_to_global[1, 0], lidar_to_global[0, 0]) / math.pi * 180
+        patch = patch_polygon(centre, roi.width, roi.length, angle)
+        place = _Place(centre, rotation_about(-angle, centre))
+        box = shapely.box(-roi.width / 2, -roi.length / 2, roi.width / 2, roi.length / 2)
+        inner = shapely.box(
+            -roi.width / 2 + BORDER, -roi.length / 2 + BORDER, roi.width / 2 - BORDER, roi.length / 2 - BORDER
+        )
+
+        crossings, crossing_ids = self._crossings(patch, place, box)
+        dividers, divider_ids = self._layers["dividers"].cut(patch, "LineString", place)
+        divider_lines = [shapely.get_coordinates(line) for line in dividers]
+        boundaries = self._boundaries(patch, place, inner)
+        boundary_ids = self._boundary_ids([place.to_global(line) for line in boundaries])
+        groups = (crossings, divider_lines, boundaries)
+        return FrameTruth(
+            kinds=np.repeat([kind.value for kind in ElementKind], [len(group) for group in groups]).astype(np.int64),
+            # Clipping is done in the lidar's axes (x right, y forward); the last step turns to x forward, y left.
+            polylines=tuple(apply(_TO_FORWARD_LEFT, line) for group in groups for line in group),
+            element_ids=np.array([*crossing_ids, *divider_ids, *boundary_ids], dtype=np.int64),
+        )
+
+    def region(self, lidar_to_global: Float, roi: RegionOfInterest) -> Polygon:
+        """Return the rectangle that a frame covers, in the global frame."""
+        angle = math.degrees(math.atan2(lidar_to_global[1, 0], lidar_to_global[0, 0]))
+        return patch_polygon(lidar_to_global[:2, 3], roi.width, roi.length, angle)
+
+    def elements_within(self, area: Any) -> list[tuple[ElementKind, Float]]:
+        """Return whole elements (crossings merged, boundaries of the union) cut by an area, global frame.
+
+        Args:
+            area: polygon or multi polygon, global frame.
+
+        Returns:
+            Kind and ``(n, 2) float64`` points per piece.
+        """
+        everywhere = _Place((0.0, 0.0), rotation_about(0.0, (0.0, 0.0)))
+        near = self._layers["crossings"].touching(area)
+        merged = shapely.intersection(np.asarray(merge_crossings(near), dtype=object), area)
+        crossings, _ = parts_of_type(merged, "Polygon")
+        dividers, _ = self._layers["dividers"].cut(area, "LineString", everywhere)
+        boundaries = cut_rings(self.rings, area) if self.rings else []
+        return [
+            *((ElementKind.PED_CROSSING, shapely.get_coordinates(polygon.exterior)) for polygon in crossings),
+            *((ElementKind.DIVIDER, shapely.get_coordinates(line)) for line in dividers),
+            *((ElementKind.BOUNDARY, line) for line in boundaries),
+        ]
+
+    def _crossings(self, patch: Polygon, place: _Place, box: Polygon) -> tuple[list[Float], list[int]]:
+        pieces, records = self._layers["crossings"].cut(patch, "Polygon", place)
+        valid = shapely.is_valid(np.asarray(pieces, dtype=object))
+        pieces = [piece for piece, good in zip(pieces, valid, strict=True) if good]
+        records = [record for record, good in zip(records, valid, strict=True) if good]
+        contours, ids = [], []
+        merged = merge_crossings(pieces)
+        insides = shapely.point_on_surface(np.asarray(pieces, dtype=object))
+        restored = keep_corners(merged, crossing_contours(merged, box), box)
+        for polygon, contour in zip(merged, restored, strict=True):
+            if contour is not None:
+                contours.append(contour)
+                members = np.flatnonzero(shapely.dwithin(polygon, insides, 1e-6))
+                ids.append(min((records[member] for member in members), default=-1))
+        return contours, ids
+
+    def _boundaries(self, patch: Polygon, place: _Place, inner: Polygon) -> list[Float]:
+        segments, _ = self._layers["road_segments"].cut(patch, "Polygon", place)
+        lanes, _ = self._layers["lanes"].cut(patch, "Polygon", place)
+        area = shapely.union(shapely.union_all(segments), shapely.union_all(lanes))
+        rings = area_rings(area)
+        return cut_rings(rings, inner) if rings else []
+
+    @cached_property
+    def rings(self) -> list[LineString]:
+        """Rings of the drivable surface of the whole map, drivable side on the right hand, global frame."""
+        return area_rings(shapely.union_all([*self._layers["road_segments"].valid, *self._layers["lanes"].valid]))
+
+    @cached_property
+    def _ring_tree(self) -> STRtree:
+        return STRtree(self.rings)
+
+    def _boundary_ids(self, lines: list[Float]) -> list[int]:
+        """Index of the whole map's ring that each piece lies on."""
+        if not lines:
+            return []
+        middles = shapely.points([_midpoint(line) for line in lines])
+        nearest = self._ring_tree.query_nearest(middles, all_matches=False)
+        return [int(row) for row in nearest[1]]
+
+
+_TO_FORWARD_LEFT = rotation_about(-90, (0.0, 0.0))
+
+
+class _Place:
+    """From the global frame to the lidar-aligned one, in the official order: turn about the centre, then shift."""
+
+    def __init__(self, centre: tuple[float, float], turn: Float) -> None:
+        self._centre = np.array(centre)
+        self._turn = turn
+
+    def to_local(self, points: Float) -> Float:
+        return apply(self._turn, points) - self._centre
+
+    def to_global(self, points: Float) -> Float:
+        return (points @ self._turn[:, :2]) + self._centre
+
+
+class _Layer:
+    """Geometries of one map layer with their spatial index; invalid ones are never found."""
+
+    def __init__(self, geometries: Sequence[Any]) -> None:
+        self._all = np.asarray(geometries, dtype=object)
+        self._rows = np.flatnonzero(shapely.is_valid(self._all) & ~shapely.is_empty(self._all))
+        self.valid = self._all[self._rows]
+        self._tree = STRtree(self.valid)
+
+    def touching(self, area: Any) -> list[Any]:
+        """Geometries that meet an area, whole, in file order."""
+        return list(self.valid[np.sort(self._tree.query(area, predicate="intersects"))])
+
+    def cut(self, patch: Polygon, part_type: str, place: _Place) -> tuple[list[Any], list[int]]:
+        """Intersect with the patch and bring the parts to the local frame; also the index of each part's record."""
+        near = np.sort(self._tree.query(patch, predicate="intersects"))
+        parts, index = parts_of_type(shapely.intersection(self.valid[near], patch), part_type)
+        records = [int(self._rows[near[row]]) for row in index]
+        return list(shapely.transform(np.asarray(parts, dtype=object), place.to_local)), records
+
+
+def truth_from_vector_map(vector_map: VectorMap) -> NuScenesGroundTruth:
+    """Ground truth of a map of the demo world, without files."""
+    return NuScenesGroundTruth.from_vector_map(vector_map)
+
+
+def _midpoint(line: Float) -> Float:
+    middle = len(line) // 2
+    return np.asarray((line[middle - 1] + line[middle]) / 2)
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    try:
+        content = orjson.loads(path.read_bytes())
+    except OSError as error:
+        raise UserError(f"Cannot read the map {path}: {error.strerror}.") from None
+    except orjson.JSONDecodeError as error:
+        raise UserError(f"{path} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is not a nuScenes map expansion: it must be one JSON object.")
+    return content
+
+
+def _polygons(
+    records: Iterable[Mapping[str, Any]], polygons: Mapping[str, Any], nodes: Mapping[str, tuple[float, float]]
+) -> list[Polygon]:
+    result = []
+    for record in records:
+        polygon = polygons[record["polygon_token"]]
+        holes = [[nodes[token] for token in hole["node_tokens"]] for hole in polygon["holes"]]
+        exterior = [nodes[token] for token in polygon["exterior_node_tokens"]]
+        result.append(Polygon(exterior, [hole for hole in holes if hole]))
+    return result

@@ -1,0 +1,319 @@
+"""nuScenes (v1.0-mini, v1.0-trainval, and anything else written in its schema)."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap, RegionOfInterest
+from mapfusion.geometry import inverse_pose
+from predmapnet.datasets.georeference import nuscenes_georeference
+from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
+from predmapnet.datasets.ground_truth.whole_map import truth_map
+from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
+from predmapnet.datasets.poses import pose_matrix
+from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
+from predmapnet.datasets.splits import split_names
+from predmapnet.errors import UserError
+
+Float = NDArray[np.float64]
+
+CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+SPLIT_LISTS = {
+    "official": {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"},
+    "mini": {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"},
+    "disjoint": {"train": "nuscenes_new_train", "val": "nuscenes_new_val"},
+}
+
+
+def find_versions(root: Path) -> tuple[str, ...]:
+    """Return the names of the ``v1.0-*`` table folders below ``root``, sorted."""
+    return tuple(sorted(path.parent.name for path in root.glob("v1.0-*/scene.json")))
+
+
+def choose_version(root: Path, version: str | None) -> str:
+    """Choose the table folder to open: what was asked for, or trainval before others, mini only when alone.
+
+    Raises:
+        UserError: nothing there, not what was asked for, or several without a clear first choice.
+    """
+    if not root.is_dir():
+        raise UserError(f"The nuScenes folder {root} does not exist.")
+    versions = find_versions(root)
+    if not versions:
+        raise UserError(
+            f"{root} holds no nuScenes tables: looked for folders v1.0-*/ with scene.json in them. "
+            "The data root is the folder that contains v1.0-trainval (or v1.0-mini), samples and maps."
+        )
+    if version is not None:
+        if version not in versions:
+            raise UserError(f"{root} holds no nuScenes version '{version}'; found: {', '.join(versions)}.")
+        return version
+    if "v1.0-trainval" in versions:
+        return "v1.0-trainval"
+    others = [name for name in versions if name != "v1.0-mini"] or ["v1.0-mini"]
+    if len(others) > 1:
+        raise UserError(f"{root} holds several nuScenes versions ({', '.join(versions)}): say which one to open.")
+    return others[0]
+
+
+class NuScenesSource:
+    """A nuScenes data set on disk.
+
+    Attributes:
+        name: ``nuscenes``.
+        root: folder with ``v1.0-*``, ``samples`` and ``maps``.
+        version: name of the table folder that is read.
+        synthetic: False.
+    """
+
+    name = "nuscenes"
+    synthetic = False
+
+    def __init__(self, root: Path, version: str | None = None, split_scheme: str | None = None) -> None:
+        """Find the tables; nothing is read yet.
+
+        Args:
+            root: folder with ``v1.0-*``, ``samples`` and ``maps``.
+            version: table folder; None takes v1.0-trainval if it is there, v1.0-mini only if nothing else is.
+            split_scheme: ``official`` (of the data set), ``disjoint`` (StreamMapNet's geographically disjoint
+                one) or ``mini``; None takes the version's own official one.
+
+        Raises:
+            UserError: nothing to open.
+        """
+        self.root = Path(root)
+        self.version = choose_version(self.root, version)
+        if split_scheme is None:
+            split_scheme = "mini" if self.version == "v1.0-mini" else "official"
+        if split_scheme not in SPLIT_LISTS:
+            raise UserError(f"There is no nuScenes split '{split_scheme}'; there are: {', '.join(SPLIT_LISTS)}.")
+        self.split_scheme = split_scheme
+        self.tables = Tables(self.root / self.version)
+        self._maps: dict[str, NuScenesGroundTruth | None] = {}
+
+    @cached_property
+    def _split_of(self) -> dict[str, str]:
+        lists = SPLIT_LISTS[self.split_scheme]
+        return {scene: split for split, name in lists.items() for scene in split_names(name)}
+
+    def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
+        """List the scenes in the order of ``scene.json``.
+
+        Scenes that no split list names (one's own logs in this schema) are given as ``test``; with the disjoint
+        split, the four scenes that it leaves out are left out.
+        """
+        names = [name for name in self.tables.scenes if self.split_scheme != "disjoint" or name in self._split_of]
+        infos = tuple(self._info(name) for name in names)
+        return infos if split is None else tuple(info for info in infos if info.split == split)
+
+    def _info(self, name: str) -> SceneInfo:
+        record = self.tables.scenes[name]
+        log = self.tables.logs.get(record["log_token"])
+        if log is None:
+            raise UserError(f"{self.tables.folder}: scene {name} names a log that log.json does not hold.")
+        return SceneInfo(
+            name=name,
+            split=self._split_of.get(name, "test"),
+            frames=int(record["nbr_samples"]),
+            location=str(log["location"]),
+            description=str(record.get("description", "")),
+        )
+
+    def open(self, scene: str, progress: Progress | None = None) -> NuScenesScene:
+        """Open one scene by name. Raises UserError with the nearest names if it is not there."""
+        if scene not in self.tables.scenes:
+            near = difflib.get_close_matches(scene, list(self.tables.scenes), n=4, cutoff=0.5)
+            hint = f" Did you mean {', '.join(near)}?" if near else ""
+            raise UserError(
+                f"{self.tables.folder} holds no scene '{scene}' among its {len(self.tables.scenes)} scenes.{hint}"
+            )
+        info = self._info(scene)
+        return NuScenesScene(self.root, self.tables, info, self._ground_truth(info.location))
+
+    def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
+        if location not in self._maps:
+            path = self.root / "maps" / "expansion" / f"{location}.json"
+            self._maps[location] = NuScenesGroundTruth(path) if path.is_file() else None
+        return self._maps[location]
+
+
+@dataclass(frozen=True)
+class _KeyFrame:
+    """What the tables say about one sample."""
+
+    token: str
+    timestamp: int
+    ego_pose: Record | None
+    sensors: Mapping[str, Record]
+
+
+class NuScenesScene:
+    """One nuScenes scene; frames are its key frames (2 Hz).
+
+    Attributes:
+        info: the scene's line in the listing.
+        rig: cameras of the first frame, in the order of the official vector-map data sets.
+        georeference: of the scene's map; None for a map that nuScenes does not know.
+        ground_truth: the map expansion of the scene's location, or None.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        tables: Tables,
+        info: SceneInfo,
+        ground_truth: NuScenesGroundTruth | None,
+        georeference: Georeference | None = None,
+    ) -> None:
+        """Read the scene's records.
+
+        Args:
+            root: folder with ``samples``.
+            tables: of the version.
+            info: the scene's line in the listing.
+            ground_truth: its map, if there is one.
+            georeference: instead of that of the location.
+        """
+        self.info = info
+        self.ground_truth = ground_truth
+        self.georeference = georeference or nuscenes_georeference(info.location)
+        self._root = root
+        self._tables = tables
+        self._frames = self._read_frames()
+        self._cameras = self._read_cameras()
+        self.rig: Rig = self.frame(0).rig
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _read_frames(self) -> list[_KeyFrame]:
+        samples = []
+        token = self._tables.scenes[self.info.name]["first_sample_token"]
+        while token:
+            if token not in self._tables.samples:
+                raise UserError(f"{self._tables.path('sample')}: sample {token} of {self.info.name} is missing.")
+            samples.append(self._tables.samples[token])
+            token = samples[-1]["next"]
+            if len(samples) > len(self._tables.samples):
+                raise UserError(f"{self._tables.path('sample')}: the samples of {self.info.name} run in a circle.")
+        if not samples:
+            raise UserError(f"{self._tables.folder}: {self.info.name} holds no frame.")
+        sensors = self._tables.sample_data(sample["token"] for sample in samples)
+        pose_tokens = {token: data[LIDAR]["ego_pose_token"] for token, data in sensors.items() if LIDAR in data}
+        poses = self._tables.ego_poses(pose_tokens.values())
+        return [
+            _KeyFrame(
+                token=sample["token"],
+                timestamp=int(sample["timestamp"]) * 1000,
+                ego_pose=poses.get(pose_tokens.get(sample["token"], "")),
+                sensors=sensors[sample["token"]],
+            )
+            for sample in samples
+        ]
+
+    def _read_cameras(self) -> dict[str, Record]:
+        """First record of each camera, in rig order: stands in for the calibration where a frame lacks an image."""
+        return {
+            channel: next(frame.sensors[channel] for frame in self._frames if channel in frame.sensors)
+            for channel in CAMERAS
+            if any(channel in frame.sensors for frame in self._frames)
+        }
+
+    def _where(self, index: int, table: str) -> str:
+        return f"{self.info.name}, frame {index}, {self._tables.folder / table}.json"
+
+    def _poses(self, index: int) -> tuple[Float, Float]:
+        """``ego_to_global`` and ``lidar_to_ego`` of the lidar's instant, as stored."""
+        frame = self._frames[index]
+        if LIDAR not in frame.sensors:
+            raise UserError(f"{self._where(index, 'sample_data')}: there is no {LIDAR} key frame, so no pose.")
+        if frame.ego_pose is None:
+            token = frame.sensors[LIDAR]["ego_pose_token"]
+            raise UserError(f"{self._where(index, 'ego_pose')}: the pose {token} is missing.")
+        ego_to_global = _pose(frame.ego_pose, self._where(index, "ego_pose"))
+        lidar_to_ego = _pose(self._calibration(frame.sensors[LIDAR]), self._where(index, "calibrated_sensor"))
+        return ego_to_global, lidar_to_ego
+
+    def _calibration(self, record: Record) -> Record:
+        return self._tables.calibrations[record["calibrated_sensor_token"]]
+
+    def frame(self, index: int) -> Frame:
+        """Return frame ``index`` (the official convention: ego axes, origin at the lidar's x, y).
+
+        The cameras' own time stamps are not used: like the official data sets, all calibrations are read as if
+        taken at the lidar's instant.
+
+        Raises:
+            IndexError: no such frame.
+            UserError: a pose is missing, not finite or not rigid.
+        """
+        if not 0 <= index < len(self._frames):
+            raise IndexError(f"{self.info.name} has {len(self._frames)} frames, not a frame {index}")
+        ego_to_global, lidar_to_ego = self._poses(index)
+        shifted_to_global = ego_to_global.copy()
+        shifted_to_global[:2, 3] = (ego_to_global @ lidar_to_ego)[:2, 3]
+        ego_to_shifted = inverse_pose(shifted_to_global) @ ego_to_global
+        frame = self._frames[index]
+        images = {
+            channel: self._root / frame.sensors[channel]["filename"] for channel in CAMERAS if channel in frame.sensors
+        }
+        return Frame(
+            scene=self.info.name,
+            index=index,
+            token=frame.token,
+            timestamp=frame.timestamp,
+            ego_to_global=shifted_to_global,
+            rig=tuple(
+                self._camera(channel, frame.sensors.get(channel, first), ego_to_shifted, index)
+                for channel, first in self._cameras.items()
+            ),
+            images={channel: path for channel, path in images.items() if path.is_file()},
+        )
+
+    def _camera(self, channel: str, record: Record, ego_to_shifted: Float, index: int) -> Camera:
+        calibration = self._calibration(record)
+        where = f"{self._where(index, 'calibrated_sensor')}, {channel}"
+        intrinsics = np.array(calibration["camera_intrinsic"], dtype=np.float64)
+        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
+            raise UserError(f"{where}: camera_intrinsic must be 3 x 3 numbers but is {intrinsics.tolist()}.")
+        return Camera(
+            name=channel,
+            width=int(record["width"]),
+            height=int(record["height"]),
+            intrinsics=intrinsics,
+            camera_to_ego=ego_to_shifted @ _pose(calibration, where),
+        )
+
+    def lidar_to_global(self, index: int) -> Float:
+        """Pose of the lidar in frame ``index``, ``(4, 4) float64``; the official ground truth hangs on it."""
+        ego_to_global, lidar_to_ego = self._poses(index)
+        return ego_to_global @ lidar_to_ego
+
+    def lidar_path(self, index: int) -> Path | None:
+        """Where the lidar sweep of frame ``index`` lies, or None if the file is not there."""
+        path = self._root / self._frames[index].sensors[LIDAR]["filename"]
+        return path if path.is_file() else None
+
+    def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
+        """Return the official ground truth of frame ``index``, or None without a map expansion."""
+        if self.ground_truth is None:
+            return None
+        return self.ground_truth.frame(self.lidar_to_global(index), roi)
+
+    def truth_map(self) -> GlobalMap | None:
+        """Return what a perfect mapper would have made of this scene, or None without a map expansion."""
+        if self.ground_truth is None:
+            return None
+        frames = [(self._frames[index].timestamp, self.lidar_to_global(index)) for index in range(len(self))]
+        return truth_map(self.ground_truth, frames, RegionOfInterest())
+
+
+def _pose(record: Record, where: str) -> Float:
+    return pose_matrix(record["rotation"], record["translation"], where)
