@@ -2,7 +2,9 @@
 
 ``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
 ``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
-(row 0 is the largest y, column 0 the smallest x). Points are normalised to ``[0, 1]`` over the ROI: x forward, y left.
+(row 0 is the largest y, column 0 the smallest x), ``H_m x W_m`` the grid of instance masks and history maps over the
+same ROI (``config.mask_size``: 25 x 50 in the lite preset). Points are normalised to ``[0, 1]`` over the ROI: x forward,
+y left.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ class Instances:
         misses: ``(B, T) int64``, frames since the score was last above the tracking threshold.
         queries: ``(B, T, C)``, last decoder layer's embedding.
         points: ``(B, T, P, 2)``, normalised, in the ego frame of the instant they were decoded at.
-        masks: ``(B, T, H, W)``, probabilities of the current frame.
+        masks: ``(B, T, H_m, W_m)``, probabilities of the current frame.
     """
 
     valid: Tensor
@@ -58,7 +60,7 @@ class StreamState:
 
     Attributes:
         instances: the tracks, as of the last frame.
-        history_maps: ``(B, T, H, W)``, history raster memory M of Sec. 3.3, in the last frame's ego frame.
+        history_maps: ``(B, T, H_m, W_m)``, history raster memory M of Sec. 3.3, in the last frame's ego frame.
         point_history: ``(B, T, n, P, 2)``, last n polylines of each track, oldest first, each in the ego frame of
             its own instant (Sec. 3.5), normalised.
         point_history_valid: ``(B, T, n) bool``.
@@ -89,7 +91,7 @@ class LayerPredictions:
     Attributes:
         logits: ``(B, T + Q, 3)`` or None in layers that do not classify.
         points: ``(B, T + Q, P, 2)``, normalised, or None in layers that have no polyline yet.
-        masks: ``(B, T + Q, H', W')`` logits, or None in layers without masks.
+        masks: ``(B, T + Q, H_m, W_m)`` logits, or None in layers without masks.
     """
 
     logits: Tensor | None
@@ -109,6 +111,7 @@ class FrameOutputs:
         segmentation: ``(B, 3, H_s, W_s)`` logits.
         bev: ``(B, C_bev, H, W)``, raw BEV features that go into the memory.
         depth: ``(B, N, D, h', w')`` logits of the auxiliary head, or None.
+        warped_history: ``(B, T, H_m, W_m)``, history maps of the track rows in this frame's ego frame, or None.
     """
 
     layers: list[LayerPredictions]
@@ -118,3 +121,34 @@ class FrameOutputs:
     segmentation: Tensor
     bev: Tensor
     depth: Tensor | None = None
+    warped_history: Tensor | None = None
+
+
+@dataclass
+class BevFeatures:
+    """What the images of one instant say of the ground, before any memory: all that a frozen-BEV stage caches.
+
+    Attributes:
+        fine: ``(B, C_0, H, W)``.
+        middle: ``(B, C_1, H / 2, W / 2)`` (rounded up).
+        coarse: ``(B, C_2, H / 4, W / 4)`` (rounded up).
+        depth: logits of the auxiliary head, or None.
+    """
+
+    fine: Tensor
+    middle: Tensor
+    coarse: Tensor
+    depth: Tensor | None = None
+
+
+@dataclass
+class Selection:
+    """What inference makes of the rows of one frame.
+
+    Attributes:
+        instances: tracks that live on, newborns included.
+        detections: further rows above the report threshold, for precision-recall curves; ``track_ids`` are -1.
+    """
+
+    instances: Instances
+    detections: Instances

@@ -1,0 +1,96 @@
+"""Short-Term Future Guidance: where a track will be in the next ego frame, as a hint to its query (Sec. 3.5)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.network.layers import Perceptron, sine_code, zero_init
+
+FREQUENCIES = 6
+
+
+class ShortTermFutureGuidance(nn.Module):
+    """A perceptron over the last n polylines forecasts the next one; its embedding is fused into the query.
+
+    Each polyline is given in the ego frame of its own instant, so the motion of the car shows in them; the motion of
+    the next step is not known when the forecast is made and has to be guessed from them.
+    """
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        width, points, histories = config.decoder.width, config.decoder.points, config.future.histories
+        hidden = config.future.hidden
+        self.offsets = Perceptron(histories * (2 * points + 1), hidden, hidden, 2 * points, zero_last=True)
+        self.point_embedding = Perceptron(4 * FREQUENCIES, width, width)
+        self.fusion = nn.Linear(2 * width, width)
+        zero_init(self.fusion)
+
+    def forecast(self, history: Tensor, valid: Tensor) -> Tensor:
+        """Predict the polylines in the ego frame of t + 1 (eq. 10).
+
+        Args:
+            history: ``(B, T, n, P, 2)``, normalised, oldest first, padded by the oldest one.
+            valid: ``(B, T, n) bool``, False in padding.
+
+        Returns:
+            ``(B, T, P, 2)``, normalised.
+        """
+        last = history[:, :, -1]
+        motion = (history[:, :, :-1] - last[:, :, None]) * valid[:, :, :-1, None, None]
+        seen = torch.cat([10.0 * motion.flatten(2), last.flatten(2) - 0.5, valid.to(last.dtype)], dim=-1)
+        return last + self.offsets(seen).unflatten(-1, last.shape[-2:]) / 10.0
+
+    def forward(self, queries: Tensor, forecasts: Tensor) -> Tensor:
+        """Fuse the forecast that was made for this instant into the track queries (eq. 11 and 12).
+
+        The fusion is a linear layer of ``[query, PE_future]``, written as a residual that starts as zero.
+
+        Args:
+            queries: ``(B, T, C)``.
+            forecasts: ``(B, T, P, 2)``, normalised.
+        """
+        future = self.point_embedding(sine_code(forecasts, FREQUENCIES)).mean(dim=2)
+        return queries + self.fusion(torch.cat([queries, future], dim=-1))
+
+
+def extend_history(
+    history: Tensor, valid: Tensor, points: Tensor, source: Tensor, matched: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Append this frame's polylines to the histories of their tracks.
+
+    The order of a line's points carries no meaning and may turn round from one frame to the next; older polylines are
+    turned with it, so that equal indices stand for about the same place.
+
+    Args:
+        history: ``(B, T, n, P, 2)`` of the former tracks, oldest first.
+        valid: ``(B, T, n) bool``.
+        points: ``(B, T', P, 2)``, of this frame.
+        source: ``(B, T') int64``, which former track an instance continues.
+        matched: ``(B, T') bool``, whether it continues one.
+
+    Returns:
+        ``(B, T', n, P, 2)`` and ``(B, T', n) bool``.
+    """
+    length = history.shape[2]
+    fresh = points[:, :, None].expand(-1, -1, length, -1, -1)
+    fresh_valid = torch.arange(length, device=points.device) == length - 1
+    fresh_valid = fresh_valid.expand(*matched.shape, length)
+    if history.shape[1] == 0:
+        return fresh, fresh_valid
+    stream = torch.arange(len(source), device=source.device)[:, None]
+    old, old_valid = history[stream, source], valid[stream, source]
+    as_is = (old[:, :, -1] - points).square().sum(dim=(-1, -2))
+    turned = (old[:, :, -1].flip(-2) - points).square().sum(dim=(-1, -2))
+    old = torch.where((turned < as_is)[..., None, None, None], old.flip(-2), old)
+    shifted = torch.cat([old[:, :, 1:], points[:, :, None]], dim=2)
+    shifted_valid = torch.cat([old_valid[:, :, 1:], torch.ones_like(old_valid[:, :, :1])], dim=2)
+    # A history that is not full yet is padded by its oldest polyline, which moves one slot towards the front.
+    oldest = shifted_valid.long().argmax(dim=2)
+    slots = torch.maximum(torch.arange(length, device=points.device), oldest[..., None])
+    padded = shifted.gather(2, slots[..., None, None].expand_as(shifted))
+    return (
+        torch.where(matched[..., None, None, None], padded, fresh),
+        torch.where(matched[..., None], shifted_valid, fresh_valid),
+    )

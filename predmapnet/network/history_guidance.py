@@ -1,0 +1,51 @@
+"""History-Map Guidance: track queries look again where they have been (Sec. 3.4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.network.layers import Attention, cell_centres, flatten_cells, sine_code, zero_init
+
+FREQUENCIES = 6
+
+
+class HistoryMapGuidance(nn.Module):
+    """Cross-attention of each track query to the BEV cells of its history map.
+
+    The branch is residual and starts as zero; a track without a valid cell keeps its query.
+    """
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        width = config.decoder.width
+        self.threshold = config.history_map.threshold
+        bev_width = config.bev.widths[1] if config.masks.stride == 2 else config.bev.widths[0]
+        self.input = nn.Linear(bev_width, width)
+        self.cell_code = nn.Linear(4 * FREQUENCIES, width)
+        self.class_code = nn.Embedding(config.decoder.classes, width)
+        self.cross_attention = Attention(width, config.decoder.heads)
+        zero_init(self.cross_attention.output)
+
+    def forward(self, queries: Tensor, labels: Tensor, history_maps: Tensor, bev: Tensor) -> Tensor:
+        """Refine track queries (eq. 9).
+
+        Args:
+            queries: ``(B, T, C)``.
+            labels: ``(B, T) int64``.
+            history_maps: ``(B, T, H_m, W_m)``, in the current ego frame.
+            bev: ``(B, C_l, H_m, W_m)``, the BEV level of the masks' grid.
+
+        Returns:
+            ``(B, T, C)``.
+        """
+        if queries.shape[1] == 0:
+            return queries
+        rows, columns = bev.shape[-2:]
+        code = self.cell_code(sine_code(cell_centres(rows, columns, bev.device), FREQUENCIES).flatten(0, 1))
+        sampled = self.input(flatten_cells(bev)) + code
+        valid = history_maps.detach().flatten(2) > self.threshold
+        some = valid.any(dim=-1, keepdim=True)
+        refined = self.cross_attention(queries + self.class_code(labels), sampled, sampled, valid | ~some)
+        return torch.where(some, queries + refined, queries)

@@ -1,0 +1,53 @@
+"""Instance masks: the dot product of a query's mask embedding with the BEV features (end of Sec. 3.2)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.network.layers import Perceptron
+
+
+class MaskHead(nn.Module):
+    """One head for detections and tracks, at every layer that predicts masks."""
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        fine, middle, _ = config.bev.widths
+        width = config.decoder.width
+        self.stride = config.masks.stride
+        self.features = nn.Conv2d(middle if self.stride == 2 else fine, config.masks.channels, 1)
+        self.norm = nn.LayerNorm(width)
+        self.embedding = Perceptron(width, width, config.masks.channels)
+        self.bias = nn.Parameter(torch.tensor(-1.0))
+
+    def mask_features(self, fine: Tensor, middle: Tensor) -> Tensor:
+        """Return the features ``(B, C_m, H_m, W_m)`` that all queries are multiplied with."""
+        return self.features(middle if self.stride == 2 else fine)
+
+    def forward(self, queries: Tensor, mask_features: Tensor) -> Tensor:
+        """Return mask logits ``(B, R, H_m, W_m)`` of queries ``(B, R, C)``."""
+        embedding = self.embedding(self.norm(queries))
+        return (embedding @ mask_features.flatten(2)).unflatten(-1, mask_features.shape[-2:]) + self.bias
+
+
+def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float) -> Tensor:
+    """Turn masks into the cells that each query may attend to (eq. 1).
+
+    A coarse cell is in the mask if any of the cells below it is, since map lines are one cell wide. A query whose mask
+    is empty attends everywhere, as in Mask2Former.
+
+    Args:
+        mask_logits: ``(B, R, H_m, W_m)``.
+        size: rows and columns of the level that is attended to.
+        threshold: tau_L, a probability.
+
+    Returns:
+        ``(B, R, rows * columns) bool``.
+    """
+    if mask_logits.shape[-2:] != size:
+        mask_logits = F.adaptive_max_pool2d(mask_logits, size)
+    inside = mask_logits.flatten(2).sigmoid() > threshold
+    return inside | ~inside.any(dim=-1, keepdim=True)

@@ -1,0 +1,138 @@
+"""Small parts that several modules share: attention, perceptrons, convolutions and position codes."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class Attention(nn.Module):
+    """Multi-head attention with separate query and key/value inputs.
+
+    Args:
+        width: of queries and outputs.
+        heads: number of heads.
+        key_width: of keys and values; the query's width by default.
+    """
+
+    def __init__(self, width: int, heads: int, key_width: int | None = None) -> None:
+        super().__init__()
+        self.heads = heads
+        self.query = nn.Linear(width, width)
+        self.key = nn.Linear(key_width or width, width)
+        self.value = nn.Linear(key_width or width, width)
+        self.output = nn.Linear(width, width)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None = None) -> Tensor:
+        """Attend.
+
+        Args:
+            query: ``(B, R, C)``.
+            key: ``(B, S, C_k)``.
+            value: ``(B, S, C_k)``.
+            allowed: ``(B, R, S) bool`` or None; every row must allow something.
+
+        Returns:
+            ``(B, R, C)``.
+        """
+        heads = [
+            tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+            for tokens in (self.query(query), self.key(key), self.value(value))
+        ]
+        mask = None if allowed is None else allowed[:, None]
+        attended = F.scaled_dot_product_attention(*heads, attn_mask=mask)
+        return self.output(attended.transpose(1, 2).flatten(-2))
+
+
+class Perceptron(nn.Sequential):
+    """Linear layers with ReLU between them."""
+
+    def __init__(self, *widths: int, zero_last: bool = False) -> None:
+        layers: list[nn.Module] = []
+        for width_in, width_out in zip(widths[:-1], widths[1:], strict=True):
+            layers += [nn.Linear(width_in, width_out), nn.ReLU()]
+        super().__init__(*layers[:-1])
+        if zero_last:
+            zero_init(self[-1])
+
+
+class FeedForward(nn.Module):
+    """Residual two-layer perceptron with layer norm after the sum."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.perceptron = Perceptron(width, hidden, width)
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Map ``(..., C)`` to ``(..., C)``."""
+        return self.norm(tokens + self.perceptron(tokens))
+
+
+class ConvNorm(nn.Sequential):
+    """Convolution without bias and batch norm; ReLU if asked for."""
+
+    def __init__(self, channels_in: int, channels_out: int, kernel: int, stride: int = 1, relu: bool = True) -> None:
+        super().__init__(
+            nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False),
+            nn.BatchNorm2d(channels_out),
+        )
+        if relu:
+            self.append(nn.ReLU(inplace=True))
+
+
+class ResidualBlock(nn.Module):
+    """Basic block: two 3x3 convolutions and a shortcut."""
+
+    def __init__(self, channels_in: int, channels_out: int, stride: int = 1) -> None:
+        super().__init__()
+        self.first = ConvNorm(channels_in, channels_out, 3, stride)
+        self.second = ConvNorm(channels_out, channels_out, 3, relu=False)
+        plain = channels_in == channels_out and stride == 1
+        self.shortcut = nn.Identity() if plain else ConvNorm(channels_in, channels_out, 1, stride, relu=False)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, C_in, h, w)`` to ``(B, C_out, h / stride, w / stride)``."""
+        return F.relu(self.second(self.first(features)) + self.shortcut(features))
+
+
+def zero_init(layer: nn.Module) -> None:
+    """Set the weight and bias of a linear or convolution layer to zero: a residual branch that starts as nothing."""
+    assert isinstance(layer, nn.Linear | nn.Conv2d)
+    nn.init.zeros_(layer.weight)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+
+
+def sine_code(positions: Tensor, frequencies: int) -> Tensor:
+    """Encode coordinates in [0, 1] by sines and cosines of octaves from half a period up.
+
+    Args:
+        positions: ``(..., d)``.
+        frequencies: octaves per coordinate.
+
+    Returns:
+        ``(..., d * 2 * frequencies)``.
+    """
+    octaves = math.pi * 2.0 ** torch.arange(frequencies, device=positions.device, dtype=positions.dtype)
+    angles = (positions[..., None] * octaves).flatten(-2)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def cell_centres(rows: int, columns: int, device: torch.device | None = None) -> Tensor:
+    """Normalised centres (x, y) of the cells of a grid over the ROI; row 0 is the largest y.
+
+    Returns:
+        ``(rows, columns, 2) float32`` in [0, 1].
+    """
+    x = (torch.arange(columns, device=device) + 0.5) / columns
+    y = 1.0 - (torch.arange(rows, device=device) + 0.5) / rows
+    return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+
+
+def flatten_cells(features: Tensor) -> Tensor:
+    """Turn a map ``(B, C, h, w)`` into tokens ``(B, h * w, C)``, row by row."""
+    return features.flatten(2).transpose(1, 2)
