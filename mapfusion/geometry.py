@@ -75,7 +75,7 @@ def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
     """
     box = shapely.box(-roi.length / 2, -roi.width / 2, roi.length / 2, roi.width / 2)
     parts = shapely.get_parts(shapely.intersection(shapely.LineString(points), box))
-    return [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString"]
+    return [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and not part.is_empty]
 
 
 def chamfer_distance(first: Float, second: Float) -> float:
