@@ -134,5 +134,5 @@ def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Pa
     if not folder.exists():
         from predmapnet.demo_world.nuscenes_writer import write_scene
 
-        write_scene(build_world(name), folder, progress)
+        write_scene(build_world(name), folder, WORLD_VERSION, progress=progress)
     return folder

@@ -53,6 +53,11 @@ def pave(plan: TownPlan, corner_radius: float) -> shapely.Geometry:
     return joined.buffer(corner_radius, quad_segs=12).buffer(-corner_radius, quad_segs=12).simplify(0.02)
 
 
+def has_splitter(plan: TownPlan, road: Road, node: int) -> bool:
+    """Whether an island divides the directions where a road without a median meets a roundabout."""
+    return node >= 0 and plan.nodes[node].is_roundabout and road.section.median == 0.0
+
+
 def _ends_here(plan: TownPlan, road: int, node: int) -> bool:
     return sum(plan.edges[edge].road == road for edge, _ in plan.arms(node)) == 1
 
@@ -64,17 +69,18 @@ def _far_side(plan: TownPlan, road: int, node: int, ending: Road, side: int) -> 
     through = plan.roads[plan.edges[edge].road]
     station = plan.edges[edge].start if arm_side == 1 else plan.edges[edge].end
     position = plan.nodes[node].position
-    inward = plan_direction(plan, ending, position) * side
+    inward = _direction_near(ending, position) * side
     along = through.direction(np.array([station]))[0]
     to_left = along[0] * inward[1] - along[1] * inward[0]
     sides = (-40.0, 0.0) if to_left > 0 else (0.0, 40.0)
     return through.strip(max(station - 35.0, 0.0), min(station + 35.0, through.length), *sides)
 
 
-def plan_direction(plan: TownPlan, road: Road, position: Float) -> Float:
+def _direction_near(road: Road, position: Float) -> Float:
     """Unit tangent of a road at its sample nearest to a position."""
     nearest = int(np.argmin(np.linalg.norm(road.points - position, axis=1)))
-    return road.tangents[nearest]
+    tangent: Float = road.tangents[nearest]
+    return tangent
 
 
 def clear_distance(plan: TownPlan, pavement: shapely.Geometry, edge_index: int, side: int) -> float:

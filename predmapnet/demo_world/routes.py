@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.random import Generator
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mapfusion.geometry import arc_length
-from predmapnet.demo_world.junctions import Arm
+from predmapnet.demo_world.junctions import Arm, has_splitter
 from predmapnet.demo_world.town import Town
 from predmapnet.demo_world.world import Trajectory
 
@@ -24,11 +25,20 @@ FIRST_TIMESTAMP = 1_532_402_927_000_000_000
 MARGIN = 48.0
 """No key frame lies closer than this to the open end of a road, metres."""
 
+SHARPEST_BEND = 0.17
+"""Curvature that a drive may have, per metre."""
+
 PATH_STEP = 0.25
 LATERAL_LIMIT = 2.3
 ACCELERATION_LIMIT = 1.6
 BRAKING_LIMIT = 2.2
 """Metres per second squared."""
+
+KERB_TO_AXLE = 1.9
+"""Between the kerb and the middle of the rear axle in a right turn, metres."""
+
+SPLITTER_SWERVE = 0.6
+"""How far cars keep to the right of their lane at a splitter island, metres."""
 
 FRONT_OVERHANG = 4.0
 """From the rear axle to the front bumper, metres."""
@@ -95,7 +105,7 @@ def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
         path, stops = _trace(random, town, legs)
         if best is None or len(path) > len(best[0]):
             best = path, stops
-        if len(path) * PATH_STEP > 20.0 * 12.0 + 20.0 and _sharpest(path) < 0.25:
+        if len(path) * PATH_STEP > 20.0 * 12.0 + 20.0 and _sharpest(path) < SHARPEST_BEND:
             return path, stops
     if best is None:
         raise RuntimeError("the town has no road that is long enough for a drive")
@@ -140,9 +150,11 @@ def _turn_angle(town: Town, leg: Leg, following: Leg) -> float:
     return float(np.angle(np.exp(1j * (headings[1] - headings[0]))))
 
 
-def _lane_for(town: Town, leg: Leg, turn: float | None, usual: int) -> int:
-    """The lane to be in for a turn at the end or the start of a leg: right, left, or the usual one."""
+def _lane_for(town: Town, leg: Leg, node: int, turn: float | None, usual: int) -> int:
+    """The lane to be in at a node: the outermost for a right turn or a roundabout, the innermost for a left turn."""
     lanes = town.plan.roads[town.plan.edges[leg.edge].road].section.lanes
+    if node >= 0 and town.plan.nodes[node].is_roundabout:
+        return lanes - 1
     if turn is None or abs(turn) < np.radians(35.0):
         return min(usual, lanes - 1)
     return 0 if turn > 0 else lanes - 1
@@ -150,14 +162,14 @@ def _lane_for(town: Town, leg: Leg, turn: float | None, usual: int) -> int:
 
 def _trace(random: Generator, town: Town, legs: list[Leg]) -> tuple[Float, Float]:
     """Join the lanes of the legs into one smooth path."""
-    turns = [_turn_angle(town, leg, following) for leg, following in zip(legs[:-1], legs[1:], strict=True)]
+    turns = [_turn_angle(town, leg, following) for leg, following in pairwise(legs)]
     usual = int(random.integers(3))
     pieces: list[Float] = []
     stop_points: list[Float] = []
     for index, leg in enumerate(legs):
         first, last = _ends(town, leg)
-        lane_in = _lane_for(town, leg, turns[index - 1] if index else None, usual)
-        lane_out = _lane_for(town, leg, turns[index] if index < len(turns) else None, usual)
+        lane_in = _lane_for(town, leg, first.node, turns[index - 1] if index else None, usual)
+        lane_out = _lane_for(town, leg, last.node, turns[index] if index < len(turns) else None, usual)
         lane_line = _lane_line(town, leg, first, last, lane_in, lane_out)
         if index == 0:
             lane_line = _trimmed(lane_line, MARGIN if first.node < 0 else float(random.uniform(0.0, 25.0)), 0.0)
@@ -192,7 +204,11 @@ def _lane_line(town: Town, leg: Leg, first: Arm, last: Arm, lane_in: int, lane_o
     stations = np.linspace(begin, finish, max(2, int(abs(finish - begin)) + 1))
     share = np.clip((np.linspace(0.0, 1.0, len(stations)) - 0.1) / 0.75, 0.0, 1.0)
     blend = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    offsets = (1.0 - blend) * road.section.lane_centre(lane_in) + blend * road.section.lane_centre(lane_out)
+    swerves = [SPLITTER_SWERVE if has_splitter(town.plan, road, arm.node) else 0.0 for arm in (first, last)]
+    start_offset, end_offset = (
+        road.section.lane_centre(lane) + swerve for lane, swerve in zip((lane_in, lane_out), swerves, strict=True)
+    )
+    offsets = (1.0 - blend) * start_offset + blend * end_offset
     return road.locate(stations, -leg.direction * offsets)
 
 
@@ -215,7 +231,7 @@ def _through_junction(town: Town, node_index: int, before: Float, after: Float) 
     start, end = before[-1], after[0]
     start_direction, end_direction = before[-1] - before[-2], after[1] - after[0]
     if not node.is_roundabout:
-        return _arc(start, start_direction, end, end_direction)
+        return _turn(start, start_direction, end, end_direction, town.corner_radius + KERB_TO_AXLE)
     radius = (node.island_radius + node.outer_radius) / 2
     enter, leave = (np.arctan2(*(point - node.position)[::-1]) for point in (start, end))
     # Traffic circles anticlockwise; it joins the ring some way behind the arm and leaves it some way before.
@@ -225,20 +241,34 @@ def _through_junction(town: Town, node_index: int, before: Float, after: Float) 
     spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     ring = node.position + radius * spokes
     along = np.stack([-spokes[:, 1], spokes[:, 0]], axis=1)
-    return np.concatenate(
-        [_arc(start, start_direction, ring[0], along[0]), ring, _arc(ring[-1], along[-1], end, end_direction)]
-    )
-
-
-def _arc(start: Float, start_direction: Float, end: Float, end_direction: Float) -> Float:
-    """A cubic Bezier curve between two poses, close to a circular arc where one fits."""
     first, last = (vector / np.linalg.norm(vector) for vector in (start_direction, end_direction))
+    return np.concatenate([_arc(start, first, ring[0], along[0]), ring, _arc(ring[-1], along[-1], end, last)])
+
+
+def _turn(start: Float, start_direction: Float, end: Float, end_direction: Float, right_radius: float) -> Float:
+    """A turn between two lanes: straight on, an arc, straight on. To the right it follows the rounded kerb."""
+    first, last = (vector / np.linalg.norm(vector) for vector in (start_direction, end_direction))
+    angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
+    if abs(angle) < np.radians(15.0):
+        return _arc(start, first, end, last)
+    # Where the two lanes would meet: start + before * first = end - after * last.
+    before, after = np.linalg.solve(np.stack([first, last], axis=1), end - start)
+    if min(before, after) < 1.0:
+        return _arc(start, first, end, last)
+    reach = min(before, after, right_radius * np.tan(-angle / 2) if angle < 0 else np.inf)
+    enter, leave = start + (before - reach) * first, end - (after - reach) * last
+    return np.concatenate([start[None], enter[None], _arc(enter, first, leave, last), leave[None], end[None]])
+
+
+def _arc(start: Float, first: Float, end: Float, last: Float) -> Float:
+    """A cubic Bezier curve between two places and directions (unit length), near a circular arc where one fits."""
     angle = max(np.arccos(np.clip(first @ last, -1.0, 1.0)), 1e-3)
     handle = 4 / 3 * np.tan(angle / 4) / (2 * np.sin(angle / 2)) * np.linalg.norm(end - start)
     t = np.linspace(0.0, 1.0, 40)[:, None]
     controls = (start, start + handle * first, end - handle * last, end)
     weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3)
-    return np.sum([weight * control for weight, control in zip(weights, controls, strict=True)], axis=0)[1:-1]
+    curve: Float = np.sum([weight * control for weight, control in zip(weights, controls, strict=True)], axis=0)
+    return curve
 
 
 def _evenly(path: Float) -> Float:
@@ -253,7 +283,8 @@ def _headings(path: Float) -> Float:
 
 
 def _curvature(path: Float) -> Float:
-    return np.abs(gaussian_filter1d(np.gradient(_headings(path)), 2.0)) / PATH_STEP
+    bend: Float = gaussian_filter1d(np.gradient(_headings(path)), 2.0)
+    return np.abs(bend) / PATH_STEP
 
 
 def _sharpest(path: Float) -> float:

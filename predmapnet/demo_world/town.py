@@ -10,10 +10,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from predmapnet.demo_world.junctions import Arm, clear_distance, pave
+from predmapnet.demo_world.junctions import Arm, clear_distance, has_splitter, pave
 from predmapnet.demo_world.roads import Road, parts
 from predmapnet.demo_world.town_plan import Edge, TownPlan, plan_town
-from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
+from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, VectorMap
 
 Float = NDArray[np.float64]
 
@@ -31,11 +31,13 @@ class Town:
     Attributes:
         plan: roads, nodes and stretches.
         arms: for each stretch its arm at the start and at the end.
+        corner_radius: of the kerbs at junctions, metres.
         vector_map: what is true about the road.
     """
 
     plan: TownPlan
     arms: tuple[tuple[Arm, Arm], ...]
+    corner_radius: float
     vector_map: VectorMap
 
 
@@ -57,7 +59,8 @@ def build_town(seed: int) -> Town:
     """Build a town of roughly 300 x 300 m. The same seed gives the same town."""
     random = np.random.default_rng([0x70776E, seed])
     plan = plan_town(random)
-    pavement = pave(plan, corner_radius=float(random.uniform(5.0, 8.5)))
+    corner_radius = float(random.uniform(5.0, 8.5))
+    pavement = pave(plan, corner_radius)
     works = _Works()
     habits = _Habits.draw(random)
     arms = tuple(
@@ -72,7 +75,7 @@ def build_town(seed: int) -> Town:
     works.islands += [
         shapely.Point(node.position).buffer(node.island_radius, 24) for node in plan.nodes if node.is_roundabout
     ]
-    return Town(plan, arms, _assemble(plan, arms, pavement, habits, works))
+    return Town(plan, arms, corner_radius, _assemble(plan, arms, pavement, habits, works))
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,8 @@ class _Habits:
         first = styles[random.choice(3, p=[0.5, 0.3, 0.2])]
         return cls(
             crossing_styles=(first, first, first, styles[random.integers(3)]),
-            crossing_share=float(random.uniform(0.65, 0.95)),
-            midblock_share=float(random.uniform(0.2, 0.6)),
+            crossing_share=float(random.uniform(0.5, 0.9)),
+            midblock_share=float(random.uniform(0.1, 0.6)),
             walkway_width=float(random.uniform(1.8, 3.6)),
             grass_share=float(random.uniform(0.0, 0.5)),
             parking_share=float(random.uniform(0.1, 0.6)),
@@ -126,7 +129,7 @@ def _build_arm(
     laterals = (inner, outer) if side == 1 else (-outer, -inner)
     if random.random() < 0.85 and not plan.nodes[node].is_roundabout:
         works.stop_lines.append(road.strip(origin + side * stop, origin + side * (stop + 0.4), *laterals))
-    if plan.nodes[node].is_roundabout and section.median == 0.0:
+    if has_splitter(plan, road, node):
         _build_splitter(road, origin, side, clear, far, works)
         stop = max(stop, far + 4.0)
     return Arm(index, side, node, clear, (near, far), stop)
@@ -151,7 +154,7 @@ def _crossing(random: Generator, road: Road, start: float, end: float, skew: flo
 
 def _build_splitter(road: Road, origin: float, side: int, clear: float, far: float, works: _Works) -> None:
     """An island between the directions at the mouth of a roundabout, and the road widened around it."""
-    half, gain = road.section.half_width, 0.9
+    half, gain = road.section.half_width, 1.0
     tip, tail = clear - 1.0, far + 3.0
     distances = np.array([clear - 4.0, clear - 2.0, tail + 1.0, tail + 9.0])
     stations, profile = origin + side * distances, half + gain * np.array([0.0, 1.0, 1.0, 0.0])
@@ -274,8 +277,3 @@ def _assemble(
         parking=tuple(works.parking),
         stop_lines=tuple(works.stop_lines),
     )
-
-
-def painted(dividers: tuple[Divider, ...]) -> list[Divider]:
-    """The dividers that a camera can see."""
-    return [divider for divider in dividers if divider.style is not LineStyle.UNPAINTED]
