@@ -1,0 +1,109 @@
+"""Draw polylines as masks, pixel by pixel as the official code draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from mapfusion.elements import ElementKind, RegionOfInterest
+
+Float = NDArray[np.float64]
+Mask = NDArray[np.uint8]
+
+CANVAS = (200, 100)
+"""Columns (x) and rows (y) of a semantic mask, whatever the size of the region."""
+THICKNESS = 3
+SMALL_MASK = 20
+"""Instance masks with fewer pixels are dilated once."""
+_SMALL_MASK_KERNEL = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+
+
+def to_pixels(points: Float, roi: RegionOfInterest, canvas: tuple[int, int] = CANVAS) -> Float:
+    """Metres in the ego frame to canvas coordinates; row 0 is the smallest y (not flipped).
+
+    Args:
+        points: ``(..., 2)``.
+        roi: region that the canvas shows.
+        canvas: columns and rows.
+
+    Returns:
+        ``(..., 2) float64``: column and row.
+    """
+    size = np.array(canvas)
+    return points * (size / roi.size) + size / 2
+
+
+def semantic_mask(
+    kinds: NDArray[np.int64],
+    polylines: Sequence[Float],
+    roi: RegionOfInterest,
+    canvas: tuple[int, int] = CANVAS,
+) -> Mask:
+    """Draw a frame's truth: crossings filled, lines three pixels thick.
+
+    Row 0 is the *smallest* y here, as in the official files; the network's BEV grid is this flipped along its rows.
+
+    Args:
+        kinds: ``(n,)`` of :class:`~mapfusion.ElementKind`.
+        polylines: ``n`` arrays ``(k, 2)``, metres, ego frame, raw vertices.
+        roi: region that the canvas shows.
+        canvas: columns and rows.
+
+    Returns:
+        ``(3, rows, columns) uint8`` of 0 and 1, one layer per kind.
+    """
+    mask = np.zeros((len(ElementKind), canvas[1], canvas[0]), dtype=np.uint8)
+    for kind, points in zip(kinds, polylines, strict=True):
+        # The official code truncates toward zero; rounding would move lines by half a pixel.
+        pixels = to_pixels(points[:, :2], roi, canvas).astype(np.int32)
+        if kind == ElementKind.PED_CROSSING:
+            cv2.fillPoly(mask[kind], [pixels], 1)
+        else:
+            cv2.polylines(mask[kind], [pixels], False, 1, thickness=THICKNESS, lineType=cv2.LINE_8)
+    return mask
+
+
+def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tuple[int, int] = CANVAS) -> Mask:
+    """Draw each polyline of one kind on a mask of its own, as for the official track ids.
+
+    Args:
+        kind: of all polylines.
+        points: ``(n, k, 2)``, metres, ego frame (float32 or float64, kept as it is).
+        roi: region that the canvas shows.
+        canvas: columns and rows.
+
+    Returns:
+        ``(n, rows * columns) uint8`` of 0 and 1.
+    """
+    size = roi.size.astype(points.dtype)
+    pixels = (points + size / 2) / size * np.array(canvas, dtype=points.dtype)
+    masks = np.zeros((len(points), canvas[1], canvas[0]), dtype=np.uint8)
+    for mask, line in zip(masks, pixels, strict=True):
+        if kind == ElementKind.PED_CROSSING:
+            image = Image.new("L", canvas, 0)
+            ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in line], outline=1, fill=1)
+            mask[:] = np.asarray(image)
+        else:
+            cv2.polylines(mask, [line.astype(np.int32)], False, 1, thickness=THICKNESS, lineType=cv2.LINE_8)
+        if cv2.countNonZero(mask) < SMALL_MASK:
+            mask[:] = cv2.dilate(mask, _SMALL_MASK_KERNEL, iterations=1)
+    return masks.reshape(len(points), -1)
+
+
+def mask_iou(first: Mask, second: Mask) -> Float:
+    """Intersection over union of every pair of masks.
+
+    Args:
+        first, second: ``(n, pixels)`` and ``(m, pixels)`` of 0 and 1.
+
+    Returns:
+        ``(n, m) float64``; 0 where both are empty.
+    """
+    # float32 counts pixels exactly up to 2**24, and its product runs at full speed.
+    together = (first.astype(np.float32) @ second.astype(np.float32).T).astype(np.float64)
+    either = first.sum(axis=1)[:, None].astype(np.float64) + second.sum(axis=1)[None] - together
+    return np.divide(together, either, out=np.zeros_like(together), where=either > 0)
