@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
@@ -28,6 +27,17 @@ class Quality:
     lateral: float
     elements_per_true: float
     ghosts_alive: int
+
+
+def nearest(points: Float, lines: list[Float]) -> Float:
+    """Return the distance of each point to the nearest of the lines, metres; far where there are none."""
+    if not lines or not len(points):
+        return np.full(len(points), FAR)
+    tree = shapely.STRtree(shapely.segmentize([shapely.LineString(line) for line in lines], 5.0))
+    (row, _), distance = tree.query_nearest(shapely.points(points), return_distance=True, all_matches=False)
+    result = np.full(len(points), FAR)
+    result[row] = distance
+    return result
 
 
 def dense(points: Float) -> Float:
@@ -51,7 +61,6 @@ def measure(fused: GlobalMap, drive: Drive, within: float = 0.5, least_views: in
     true_elements = 0
     for kind in ElementKind:
         truth = [dense(e.points) for e in drive.truth.of_kind(kind)]
-        everything = cKDTree(np.concatenate(truth) if truth else np.full((1, 2), FAR))
         seen = []
         for points in truth:
             visible = looked_at(points, drive) >= least_views
@@ -63,13 +72,12 @@ def measure(fused: GlobalMap, drive: Drive, within: float = 0.5, least_views: in
                 true_elements += max(starts - closed, 1)
         lines = [dense(e.points) for e in fused.of_kind(kind)]
         if lines:
-            distance = everything.query(np.concatenate(lines))[0]
+            distance = nearest(np.concatenate(lines), truth)
             hit += int((distance < within).sum())
             length += len(distance)
             errors.append(distance[distance < 1.5])
         wanted = np.concatenate(seen) if seen else np.zeros((0, 2))
-        tree = cKDTree(np.concatenate(lines) if lines else np.full((1, 2), FAR))
-        found += int((tree.query(wanted)[0] < within).sum()) if len(wanted) else 0
+        found += int((nearest(wanted, lines) < within).sum())
         true_length += len(wanted)
     return Quality(
         precision=hit / max(length, 1),
@@ -88,11 +96,11 @@ def ghost_alive(ghost: Ghost, fused: GlobalMap, drive: Drive) -> bool:
         return False
     others = [dense(e.points) for e in drive.truth.of_kind(ghost.kind)]
     if others:
-        points = points[cKDTree(np.concatenate(others)).query(points)[0] > 2.0]
+        points = points[nearest(points, others) > 2.0]
     lines = [dense(e.points) for e in fused.of_kind(ghost.kind)]
     if not len(points) or not lines:
         return False
-    return bool((cKDTree(np.concatenate(lines)).query(points)[0] < 1.0).mean() > 0.5)
+    return bool((nearest(points, lines) < 1.0).mean() > 0.5)
 
 
 def faults(fused: GlobalMap) -> list[str]:
