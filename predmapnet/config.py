@@ -71,7 +71,7 @@ class TemporalBevConfig(Section):
     channels: Positive = 16
     distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
     capacity: Positive = 8
-    spacing: float = Field(2.0, ge=0.0)
+    spacing: Annotated[float, Field(ge=0.0)] = 2.0
 
 
 class SemanticQueriesConfig(Section):

@@ -3,8 +3,8 @@
 ``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
 ``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
 (row 0 is the largest y, column 0 the smallest x), ``H_m x W_m`` the grid of instance masks and history maps over the
-same ROI (``config.mask_size``: 25 x 50 in the lite preset). Points are normalised to ``[0, 1]`` over the ROI: x forward,
-y left.
+same ROI (``config.mask_size``: 25 x 50 in the lite preset). Points are normalised to ``[0, 1]`` over the ROI: x
+forward, y left.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -38,12 +39,12 @@ class Attention(nn.Module):
         Returns:
             ``(B, R, C)``.
         """
-        heads = [
+        q, k, v = (
             tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for tokens in (self.query(query), self.key(key), self.value(value))
-        ]
+        )
         mask = None if allowed is None else allowed[:, None]
-        attended = F.scaled_dot_product_attention(*heads, attn_mask=mask)
+        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
         return self.output(attended.transpose(1, 2).flatten(-2))
 
 
@@ -52,7 +53,7 @@ class Perceptron(nn.Sequential):
 
     def __init__(self, *widths: int, zero_last: bool = False) -> None:
         layers: list[nn.Module] = []
-        for width_in, width_out in zip(widths[:-1], widths[1:], strict=True):
+        for width_in, width_out in pairwise(widths):
             layers += [nn.Linear(width_in, width_out), nn.ReLU()]
         super().__init__(*layers[:-1])
         if zero_last:

@@ -2,10 +2,162 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from predmapnet.network.interface import FrameOutputs, Instances
+from mapfusion.elements import RegionOfInterest
+from predmapnet.config import PredMapNetConfig, TrackingConfig
+from predmapnet.network.interface import FrameOutputs, Instances, Selection, StreamState
+from predmapnet.network.polylines import chamfer_distances, resample_polylines
+
+
+@torch.no_grad()
+def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetConfig) -> Selection:
+    """Decide what lives on, at inference.
+
+    Tracks keep their ids. With merging, a track takes up the detections of its class that lie close to it: it gets the
+    query and geometry of the higher score and the noisy-or of both scores, and what was taken up is gone; of two tracks
+    of one thing the older lives on, of two newborns the one with the higher score. A track ends after too many
+    frames without support (``tau_t``); a detection above ``tau_d`` that nothing took up is born.
+
+    Args:
+        outputs: of this frame.
+        state: that went into it.
+        config: of the network.
+    """
+    rules = config.tracking
+    rows = _candidates(outputs, state, rules)
+    tracks = rows.track_ids.shape[1]
+    detection_rows, detection_scores = rows.rows[:, tracks:], rows.scores[:, tracks:]
+    source, scores, alive = rows.rows[:, :tracks], rows.scores[:, :tracks], rows.valid[:, :tracks]
+    free = rows.valid[:, tracks:]
+    if rules.merge:
+        distances = _line_distances(outputs, rows, config.roi, rules)
+        alive = alive & ~_has_older_twin(distances[:, :tracks, :tracks], rows.track_ids, rules)
+        source, scores, taken = _take_up(distances[:, :tracks, tracks:], rows, alive, rules)
+        free = free & ~taken
+        free = free & ~_has_better_twin(distances[:, tracks:, tracks:], free & (detection_scores > rules.tau_d), rules)
+    born = free & (detection_scores > rules.tau_d)
+    misses = torch.where(scores > rules.tau_t, 0, rows.misses + 1)
+    alive = alive & (misses <= rules.misses_allowed)
+
+    first_id = torch.zeros_like(born[:, 0].long()) if state is None else state.next_track_id
+    new_ids = first_id[:, None] + born.long().cumsum(dim=1) - 1
+    instances = _compact(
+        outputs,
+        rows=torch.cat([source, detection_rows], dim=1),
+        valid=torch.cat([alive, born], dim=1),
+        track_ids=torch.cat([rows.track_ids, new_ids], dim=1),
+        misses=torch.cat([misses, torch.zeros_like(new_ids)], dim=1),
+        scores=torch.cat([scores, detection_scores], dim=1),
+    )
+    no_id, no_misses = torch.full_like(new_ids, -1), torch.zeros_like(new_ids)
+    detections = _compact(outputs, detection_rows, free & ~born, no_id, no_misses, detection_scores)
+    return Selection(instances, detections)
+
+
+@dataclass
+class _Rows:
+    """Rows that matter: all ``T`` tracks, then the ``D`` best detections in falling order of score.
+
+    Attributes:
+        rows: ``(B, T + D) int64``, rows of the outputs.
+        valid: ``(B, T + D) bool``.
+        scores: ``(B, T + D)``.
+        labels: ``(B, T + D) int64``.
+        track_ids, misses: ``(B, T) int64``.
+    """
+
+    rows: Tensor
+    valid: Tensor
+    scores: Tensor
+    labels: Tensor
+    track_ids: Tensor
+    misses: Tensor
+
+
+def _candidates(outputs: FrameOutputs, state: StreamState | None, rules: TrackingConfig) -> _Rows:
+    logits = outputs.layers[-1].logits
+    assert logits is not None
+    tracks = 0 if state is None else state.instances.track_ids.shape[1]
+    scores, labels = logits.sigmoid().max(dim=-1)
+    ranked, order = scores[:, tracks:].sort(dim=1, descending=True, stable=True)
+    # At least one column, so that nothing below has to think of none.
+    count = max(1, int((ranked > rules.report_threshold).sum(dim=1).max()))
+    track_rows = torch.arange(tracks, device=scores.device).expand(len(scores), tracks)
+    rows = torch.cat([track_rows, order[:, :count] + tracks], dim=1)
+    enough = ranked[:, :count] > rules.report_threshold
+    return _Rows(
+        rows=rows,
+        valid=torch.cat([outputs.row_valid[:, :tracks], enough], dim=1),
+        scores=scores.gather(1, rows),
+        labels=labels.gather(1, rows),
+        track_ids=outputs.row_track_ids[:, :tracks],
+        misses=rows[:, :0] if state is None else state.instances.misses,
+    )
+
+
+def _line_distances(outputs: FrameOutputs, rows: _Rows, roi: RegionOfInterest, rules: TrackingConfig) -> Tensor:
+    """Chamfer distances ``(B, n, n)`` in metres; infinite between classes, to invalid rows, and beyond interest."""
+    points = outputs.layers[-1].points
+    assert points is not None
+    size = points.new_tensor([roi.length, roi.width])
+    stream = torch.arange(len(points), device=points.device)[:, None]
+    lines = points[stream, rows.rows] * size
+    low, high = lines.amin(dim=2), lines.amax(dim=2)
+    gap = torch.maximum(low[:, :, None] - high[:, None], low[:, None] - high[:, :, None]).amax(dim=-1)
+    pairs = (rows.labels[:, :, None] == rows.labels[:, None]) & rows.valid[:, :, None] & rows.valid[:, None]
+    pairs = (pairs & (gap <= max(rules.merge_distance, rules.duplicate_distance))).triu(diagonal=1)
+    where, first, second = pairs.nonzero(as_tuple=True)
+    lines = resample_polylines(lines, rules.merge_samples)
+    distances = torch.full_like(gap, torch.inf)
+    distances[where, first, second] = chamfer_distances(lines[where, first], lines[where, second])
+    return torch.minimum(distances, distances.transpose(1, 2))
+
+
+def _has_older_twin(distances: Tensor, track_ids: Tensor, rules: TrackingConfig) -> Tensor:
+    """Tell which tracks ``(B, T)`` repeat an older one; ids grow, so the smaller one is older."""
+    older = track_ids[:, :, None] < track_ids[:, None, :]
+    return ((distances < rules.duplicate_distance) & older).any(dim=1)
+
+
+def _has_better_twin(distances: Tensor, wanted: Tensor, rules: TrackingConfig) -> Tensor:
+    """Tell which detections ``(B, D)`` repeat a better one (an earlier column) that is ``wanted`` as a newborn."""
+    twins = ((distances < rules.duplicate_distance) & wanted[:, :, None]).triu(diagonal=1)
+    return twins.any(dim=1)
+
+
+def _take_up(distances: Tensor, rows: _Rows, alive: Tensor, rules: TrackingConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Merge each track with the best of the detections that lie nearest to it.
+
+    Returns:
+        Where each track now comes from ``(B, T) int64``, its score ``(B, T)``, and which detections are gone
+        ``(B, D) bool``.
+    """
+    tracks = distances.shape[1]
+    source, scores = rows.rows[:, :tracks], rows.scores[:, :tracks]
+    if tracks == 0:
+        return source, scores, torch.zeros_like(rows.valid[:, tracks:])
+    distances = distances.masked_fill(~alive[:, :, None], torch.inf)
+    near = distances < rules.merge_distance
+    nearest = near & (distances == distances.amin(dim=1, keepdim=True))
+    best, which = torch.where(nearest, rows.scores[:, None, tracks:], 0.0).max(dim=2)
+    source = torch.where(best > scores, rows.rows[:, tracks:].gather(1, which), source)
+    return source, 1 - (1 - scores) * (1 - best), near.any(dim=1)
+
+
+def _compact(
+    outputs: FrameOutputs, rows: Tensor, valid: Tensor, track_ids: Tensor, misses: Tensor, scores: Tensor
+) -> Instances:
+    """Move valid rows to the front, in their order, and cut the padding that no stream needs."""
+    count = int(valid.sum(dim=1).max())
+    order = (~valid).long().argsort(dim=1, stable=True)[:, :count]
+    rows, valid, track_ids, misses, scores = (
+        column.gather(1, order) for column in (rows, valid, track_ids, misses, scores)
+    )
+    return instances_from_rows(outputs, rows, valid, track_ids, misses, scores)
 
 
 def instances_from_rows(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
@@ -15,6 +16,8 @@ from predmapnet.datasets.source import Camera, Float, Rig
 from predmapnet.network.image_backbone import STRIDE
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.network.layers import cell_centres
+
+Integer = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -83,14 +86,14 @@ def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
     rows, columns = -(-config.image.height // STRIDE), -(-config.image.width // STRIDE)
     roi = config.roi
     ground = (cell_centres(*grid).double().numpy().reshape(-1, 2) - 0.5) * roi.size
-    entries: list[tuple[Float, Float, Float]] = []
+    entries: list[tuple[Integer, Integer, Float]] = []
     visible = np.zeros((len(ground), len(rig)), dtype=np.float32)
     for number, camera in enumerate(rig):
         pixels, seen = _project(ground, camera, config)
         visible[seen, number] = 1.0
         cells = np.flatnonzero(seen)
-        for corner, weight in _bilinear(pixels[cells] / STRIDE - 0.5, rows, columns):
-            entries.append((cells, corner + number * rows * columns, weight))
+        for corner, share in _bilinear(pixels[cells] / STRIDE - 0.5, rows, columns):
+            entries.append((cells, corner + number * rows * columns, share))
     cell, pixel, weight = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*entries, strict=True))
     weight = weight.float()
     return RigLookup(
@@ -102,7 +105,7 @@ def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
     )
 
 
-def _project(ground: Float, camera: Camera, config: PredMapNetConfig) -> tuple[Float, np.ndarray]:
+def _project(ground: Float, camera: Camera, config: PredMapNetConfig) -> tuple[Float, NDArray[np.bool_]]:
     """Return pixels ``(n, 2)`` in the network's window, and whether each point is inside it."""
     rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
     points = (np.column_stack([ground, np.zeros(len(ground))]) - position) @ rotation
@@ -113,7 +116,7 @@ def _project(ground: Float, camera: Camera, config: PredMapNetConfig) -> tuple[F
     return pixels, (depth > 0.1) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
 
 
-def _bilinear(pixels: Float, rows: int, columns: int) -> list[tuple[np.ndarray, Float]]:
+def _bilinear(pixels: Float, rows: int, columns: int) -> list[tuple[Integer, Float]]:
     """Return the four neighbours of each position (flat index, clamped at the border) and their weights."""
     base = np.floor(pixels)
     fraction = pixels - base
@@ -136,7 +139,7 @@ class _SparseProduct(torch.autograd.Function):
         return torch.stack([lookup.gather.multiply(table) for table in features])
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return torch.stack([ctx.scatter.multiply(table) for table in gradient.contiguous()]), None
 
 
@@ -154,7 +157,7 @@ def to_ground(features: Tensor, camera_valid: Tensor, lookup: RigLookup) -> Tens
     batch = len(features)
     features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
     pixels = features.permute(0, 1, 3, 4, 2).reshape(batch, -1, features.shape[2])
-    summed = _SparseProduct.apply(pixels, lookup)
+    summed = _SparseProduct.apply(pixels, lookup)  # type: ignore[no-untyped-call]
     cameras = camera_valid.to(summed.dtype) @ lookup.visible.to(summed.dtype).T
     ground = summed / cameras.clamp(min=1.0)[..., None]
     return ground.unflatten(1, lookup.grid).permute(0, 3, 1, 2)
