@@ -1,0 +1,66 @@
+"""``predmapnet batch``: map many scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Weights
+
+
+def batch(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to; made if it does not exist.")],
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Names of scenes, or the folder of a data set; all scenes if none.")
+    ] = None,
+    split: Annotated[str | None, typer.Option(help="All scenes of a split: train, val or test.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
+    recordings: Annotated[bool, typer.Option("--recordings", help="Write a Rerun recording of each scene.")] = False,
+    save_frames: Annotated[bool, typer.Option("--save-frames", help="Write what each frame showed (Parquet).")] = False,
+    dataset: Dataset = None,
+    data_root: DataRoot = None,
+    weights: Weights = None,
+    device: Device = "auto",
+    allow_missing_cameras: AllowMissingCameras = False,
+) -> None:
+    """Map many scenes with several processes; run it again to resume where it stopped.
+
+    Writes NAME.geojson and NAME.summary.json of each scene, log.jsonl and summary.json. The exit code is 1 if any
+    scene failed.
+    """
+    from predmapnet.weights.checkpoint import weights_hash
+
+    from cli.console import err, progress_display, say_outcomes
+    from predmapnet.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
+    from predmapnet.datasets.selection import open_source
+    from predmapnet.threads import available_cores
+
+    names = list(scenes or [])
+    if len(names) == 1 and Path(names[0]).is_dir():
+        data_root, names = Path(names[0]), []
+    source, sentence = open_source(dataset, data_root)
+    err.print(sentence, markup=False)
+    chosen = choose_scenes(source, names, split)
+    prepare_folder(out)
+    settings = BatchSettings(
+        dataset,
+        data_root,
+        weights,
+        device,
+        allow_missing_cameras,
+        recordings,
+        save_frames,
+        threads=max(1, available_cores() // jobs),
+    )
+    journal = BatchJournal(out)
+    with progress_display() as display:
+        display.scenes(0, len(chosen))
+        for outcome in map_scenes(chosen, out, settings, jobs, weights_hash(weights)):
+            journal.add(outcome)
+            display.scenes(len(journal.outcomes), len(chosen))
+    journal.close()
+    say_outcomes(journal.outcomes, out)
+    if any(outcome.status == "failed" for outcome in journal.outcomes):
+        raise typer.Exit(1)

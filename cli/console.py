@@ -1,0 +1,147 @@
+"""What the commands say: messages, progress (bars in a terminal, plain lines elsewhere) and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import monotonic
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from predmapnet.batch import Outcome
+    from predmapnet.pipeline import SceneReport
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+SECONDS_BETWEEN_LINES = 5.0
+
+
+def say_error(message: str) -> None:
+    """Print one message for something that the user can put right."""
+    err.print(f"[bold red]Error:[/] {escape(message)}")
+
+
+def say_warning(message: str) -> None:
+    """Print one message for something that the user should know."""
+    err.print(f"[bold yellow]Note:[/] {escape(message)}")
+
+
+class ProgressDisplay:
+    """Shows how far a run is; both methods fit the callbacks of the pipeline."""
+
+    def __init__(self, bars: Progress | None) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+        self._began: dict[str, float] = {}
+        self._spoke: dict[str, float] = {}
+
+    def preparing(self, done: int, total: int, what: str) -> None:
+        """Something is made ready."""
+        self._show(what, done, total, "")
+
+    def frames(self, done: int, total: int) -> None:
+        """Frames are mapped."""
+        self._show("mapping", done, total, "frames/s")
+
+    def scenes(self, done: int, total: int) -> None:
+        """Scenes of a batch are finished."""
+        self._show("scenes", done, total, "")
+
+    def _show(self, what: str, done: int, total: int, unit: str) -> None:
+        now = monotonic()
+        began = self._began.setdefault(what, now)
+        rate = f"{done / (now - began):.1f} {unit}" if unit and now > began else ""
+        if self._bars is not None:
+            if what not in self._tasks:
+                self._tasks[what] = self._bars.add_task(what, total=total, rate="")
+            self._bars.update(self._tasks[what], completed=done, total=total, rate=rate)
+        elif done == total or now - self._spoke.get(what, began) >= SECONDS_BETWEEN_LINES:
+            self._spoke[what] = now
+            err.print(f"{what}: {done} of {total}{'  ' + rate if rate else ''}")
+
+
+@contextmanager
+def progress_display() -> Iterator[ProgressDisplay]:
+    """Show progress on stderr while the block runs."""
+    if not err.is_terminal:
+        yield ProgressDisplay(None)
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err) as bars:
+        yield ProgressDisplay(bars)
+
+
+def report_table(report: SceneReport) -> Table:
+    """Sum up one scene."""
+    table = Table(title=report.scene, title_justify="left", title_style="bold", show_edge=False, pad_edge=False)
+    table.add_column("")
+    table.add_column("elements", justify="right")
+    table.add_column("metres", justify="right")
+    for label, count in report.elements.items():
+        table.add_row(label, str(count), f"{report.metres[label]:.0f}")
+    return table
+
+
+def report_lines(report: SceneReport) -> list[str]:
+    """Say what stands below the table: time, accuracy, files."""
+    prepared = f", {report.preparing_seconds:.1f} s to prepare" if report.preparing_seconds >= 1.0 else ""
+    lines = [f"{report.frames} frames in {report.seconds:.1f} s ({report.frames_per_second:.1f} frames/s){prepared}"]
+    if report.accuracy is not None:
+        accuracy = report.accuracy
+        lines.append(
+            f"against the ground truth: mAP {accuracy.frame_map:.3f} of the frames; "
+            f"precision {accuracy.precision:.3f} and recall {accuracy.recall:.3f} of the map at 1.0 m"
+        )
+    lines.extend(f"written: {path}" for path in report.written)
+    return lines
+
+
+def say_report(report: SceneReport) -> None:
+    """Print the table, and what the integrator left out."""
+    out.print(report_table(report))
+    for line in report_lines(report):
+        out.print(line, markup=False)
+    for reason, count in report.rejections.items():
+        say_warning(f"the integrator left out {count} x {reason}")
+
+
+def say_outcomes(outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Print one line per scene of a batch, and what failed with its reason."""
+    table = Table("scene", "", show_edge=False, pad_edge=False)
+    for heading in ("elements", "metres", "frames/s", "mAP", "precision", "recall"):
+        table.add_column(heading, justify="right")
+    for outcome in sorted(outcomes, key=lambda outcome: outcome.scene):
+        table.add_row(outcome.scene, outcome.status, *_figures(outcome))
+    out.print(table)
+    for outcome in outcomes:
+        if outcome.reason is not None:
+            say_error(f"{outcome.scene}: {outcome.reason}")
+    failed = sum(outcome.status == "failed" for outcome in outcomes)
+    out.print(
+        f"{len(outcomes) - failed} of {len(outcomes)} scenes are done; see {folder / 'summary.json'}", markup=False
+    )
+
+
+def _figures(outcome: Outcome) -> list[str]:
+    if outcome.report is None:
+        return []
+    report, accuracy = outcome.report, outcome.report["accuracy"]
+    measured = [f"{accuracy[name]:.3f}" for name in ("frame_map", "precision", "recall")] if accuracy else []
+    elements, metres = sum(report["elements"].values()), sum(report["metres"].values())
+    return [str(elements), f"{metres:.0f}", f"{report['frames_per_second']:.1f}", *measured]

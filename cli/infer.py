@@ -1,0 +1,39 @@
+"""``predmapnet infer``: map one scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Threads, Weights
+
+
+def infer(
+    scene: Annotated[str, typer.Argument(help="Name of the scene; `predmapnet scenes` lists them.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write (GeoJSON).")],
+    recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
+    save_frames: Annotated[Path | None, typer.Option(help="What each frame showed, to write (Parquet).")] = None,
+    dataset: Dataset = None,
+    data_root: DataRoot = None,
+    weights: Weights = None,
+    device: Device = "auto",
+    threads: Threads = 0,
+    allow_missing_cameras: AllowMissingCameras = False,
+) -> None:
+    """Turn one driving scene into a global vector map."""
+    from cli.console import err, progress_display, say_report
+    from predmapnet.outputs import Outputs
+    from predmapnet.threads import use_threads
+
+    outputs = Outputs(out, recording, save_frames)
+    outputs.check()
+    use_threads(threads)
+    from predmapnet.pipeline import MappingPipeline
+
+    pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras)
+    err.print(pipeline.sentence, markup=False)
+    with progress_display() as display:
+        report = pipeline.run(scene, outputs, display.preparing, display.frames)
+    say_report(report)

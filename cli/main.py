@@ -1,0 +1,85 @@
+"""The command line: one file per command, and one place where errors become messages.
+
+Exit codes: 0 done, 1 some scenes of a batch failed, 2 a mistake or broken input (one message says which),
+130 stopped with Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from cli.batch import batch
+from cli.console import say_error
+from cli.infer import infer
+from cli.scenes import scenes
+from cli.view import view
+from predmapnet.errors import UserError
+
+DISK_IS_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+app = typer.Typer(
+    name="predmapnet",
+    help="From driving logs to clean vector maps. Start with:  predmapnet infer scene-0103 --out map.geojson",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command()(infer)
+app.command()(view)
+app.command()(batch)
+app.command()(scenes)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from predmapnet import __version__
+
+        typer.echo(f"predmapnet {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", envvar="PREDMAPNET_DEBUG", help="Show tracebacks instead of messages.")
+    ] = False,
+) -> None:
+    """Options of all commands."""
+    if debug:
+        os.environ["PREDMAPNET_DEBUG"] = "1"
+
+
+def main() -> None:
+    """Run a command; turn what the user can put right into one message and an exit code."""
+    try:
+        app()
+    except SystemExit as end:
+        if end.code == 130:
+            say_error("stopped; files that were not finished have been removed")
+        raise
+    except UserError as error:
+        _fail(str(error), error)
+    except OSError as error:
+        if error.errno not in DISK_IS_FULL:
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        _fail(f"the disk is full{where}; make room and run the command again", error)
+
+
+def _fail(message: str, error: Exception) -> None:
+    if os.environ.get("PREDMAPNET_DEBUG"):
+        raise error
+    say_error(message)
+    sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""Options that several commands share, so that they are called the same everywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Dataset = Annotated[
+    str | None,
+    typer.Option(
+        help="nuscenes, argoverse2 or demo; or set PREDMAPNET_DATASET. The demo world if nothing is configured.",
+    ),
+]
+DataRoot = Annotated[
+    Path | None, typer.Option(help="Folder of the data set; or set PREDMAPNET_DATA_ROOT.", show_default=False)
+]
+Weights = Annotated[
+    Path | None, typer.Option(help="Checkpoint (safetensors). By default the one that comes with PredMapNet.")
+]
+Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
+Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
+AllowMissingCameras = Annotated[
+    bool, typer.Option("--allow-missing-cameras", help="Go on where a camera has no image, instead of stopping.")
+]

@@ -1,0 +1,38 @@
+"""``predmapnet scenes``: list what a data set holds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from cli.options import DataRoot, Dataset
+
+
+def scenes(
+    split: Annotated[str | None, typer.Option(help="Only this split: train, val or test.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+    dataset: Dataset = None,
+    data_root: DataRoot = None,
+) -> None:
+    """List the scenes of a data set."""
+    from predmapnet.datasets.selection import open_source
+
+    source, sentence = open_source(dataset, data_root)
+    found = source.scenes(split)
+    if as_json:
+        import orjson
+
+        typer.echo(orjson.dumps([asdict(scene) for scene in found], option=orjson.OPT_INDENT_2))
+        return
+    from rich.table import Table
+
+    from cli.console import err, out
+
+    err.print(sentence, markup=False)
+    table = Table("scene", "split", "frames", "location", "ready", "", show_edge=False, pad_edge=False)
+    for scene in found:
+        ready = "yes" if scene.ready else "made when used"
+        table.add_row(scene.name, scene.split, str(scene.frames), scene.location, ready, scene.description)
+    out.print(table)

@@ -1,0 +1,52 @@
+"""``predmapnet view``: look at a scene while it is mapped, at a recording, or at a map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Threads, Weights
+
+
+def view(
+    what: Annotated[str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson).")],
+    web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
+    port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Write a recording (.rrd) instead of opening a viewer.")
+    ] = None,
+    dataset: Dataset = None,
+    data_root: DataRoot = None,
+    weights: Weights = None,
+    device: Device = "auto",
+    threads: Threads = 0,
+    allow_missing_cameras: AllowMissingCameras = False,
+) -> None:
+    """Open Rerun: live while a scene is mapped, or with a recording or a map.
+
+    Without a display, a scene or map is written to a recording, and the command says how to look at it.
+    """
+    from cli.console import err, progress_display, say_report
+    from cli.viewer import Viewer
+    from predmapnet.outputs import Outputs
+    from predmapnet.threads import use_threads
+
+    if what.endswith(".rrd"):
+        Viewer.show_file(Path(what), web, port)
+        return
+    with Viewer.open(Path(what).stem, web, port, out) as viewer:
+        if what.endswith((".geojson", ".json")):
+            from predmapnet.recording import log_map_file
+
+            log_map_file(viewer.recording, Path(what))
+            return
+        use_threads(threads)
+        from predmapnet.pipeline import MappingPipeline
+
+        pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras)
+        err.print(pipeline.sentence, markup=False)
+        with progress_display() as display:
+            report = pipeline.run(what, Outputs(), display.preparing, display.frames, viewer.recording)
+        say_report(report)

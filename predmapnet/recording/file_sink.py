@@ -1,0 +1,57 @@
+"""A recording file that notices a full disk.
+
+Rerun's own file writer only prints such an error, and then blocks whoever goes on logging. So it writes into a pipe,
+and a thread here carries the bytes to the disk: it keeps draining after an error, and the error is raised at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import rerun as rr
+
+from predmapnet.files import partial_name, write_whole
+
+
+class RecordingFile:
+    """Sends a recording to ``path``; the file appears, whole, when the ``with`` block ends well."""
+
+    def __init__(self, recording: rr.RecordingStream, path: Path) -> None:
+        self._recording = recording
+        self._path = path
+        self._error: OSError | None = None
+
+    def __enter__(self) -> Self:
+        source, target = os.pipe()
+        self._pump = threading.Thread(target=self._carry, args=(source,), daemon=True)
+        self._pump.start()
+        self._recording.set_sinks(rr.FileSink(f"/dev/fd/{target}"))
+        os.close(target)
+        return self
+
+    def _carry(self, source: int) -> None:
+        with open(source, "rb", buffering=0) as pipe:
+            try:
+                with partial_name(self._path).open("wb") as file:
+                    while block := pipe.read(1 << 20):
+                        file.write(block)
+            except OSError as error:
+                self._error = error
+                while pipe.read(1 << 20):
+                    pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._recording.disconnect()
+        self._pump.join()
+        if kind is not None:
+            partial_name(self._path).unlink(missing_ok=True)
+            return
+        with write_whole(self._path):
+            if self._error is not None:
+                raise self._error

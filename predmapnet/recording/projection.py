@@ -1,0 +1,89 @@
+"""Lines in pictures: densify, project into a camera, cut where they leave it; dashes; BEV pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from mapfusion.elements import RegionOfInterest
+from mapfusion.geometry import arc_length
+from predmapnet.datasets.source import Camera
+
+Float = NDArray[np.float64]
+
+NEAR_METRES = 1.0
+"""Points nearer to the camera plane than this are cut off: their projection runs away."""
+
+
+def densify(points: Float, spacing: float) -> Float:
+    """Insert points so that no step is longer than ``spacing`` metres; vertices stay.
+
+    Args:
+        points: ``(n, 2)``, metres.
+        spacing: metres.
+    """
+    distance = arc_length(points)
+    count = max(2, int(np.ceil(distance[-1] / spacing)) + 1)
+    stations = np.sort(np.concatenate([distance, np.linspace(0.0, distance[-1], count)]))
+    return np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=1)
+
+
+def runs(mask: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches of at least two consecutive true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start >= 2]
+
+
+def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Float]:
+    """Project a line on the road into a picture and keep the parts that are seen.
+
+    Args:
+        points: ``(n, 2)``, metres, ego frame, on the plane z = 0.
+        camera: where it looks.
+        spacing: distance between projected points, metres.
+
+    Returns:
+        List of ``(k, 2) float64`` pixels.
+    """
+    dense = densify(points, spacing)
+    lifted = np.column_stack([dense, np.zeros(len(dense))])
+    rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
+    rays = (lifted - position) @ rotation @ camera.intrinsics.T
+    ahead = rays[:, 2] > NEAR_METRES
+    pixels = rays[:, :2] / np.where(ahead, rays[:, 2], 1.0)[:, None]
+    border = shapely.box(0, 0, camera.width, camera.height)
+    lines = [shapely.LineString(pixels[run]) for run in runs(ahead)]
+    parts = shapely.get_parts(shapely.intersection(lines, border))
+    return [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and not part.is_empty]
+
+
+def dashes(points: Float, dash: float = 0.7, gap: float = 0.5) -> list[Float]:
+    """Cut a line into dashes.
+
+    Args:
+        points: ``(n, 2)``, metres.
+        dash, gap: metres.
+    """
+    distance = arc_length(points)
+    starts = np.arange(0.0, distance[-1], dash + gap)
+    stations = np.stack([starts, np.minimum(starts + dash, distance[-1])], axis=1)
+    ends = np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=-1)
+    return list(ends)
+
+
+def bev_pixels(points: Float, roi: RegionOfInterest, shape: tuple[int, int]) -> Float:
+    """Map ego coordinates to pixels of a BEV raster (row 0 is the largest y, column 0 the smallest x).
+
+    Args:
+        points: ``(n, 2)``, metres, ego frame.
+        roi: what the raster covers.
+        shape: rows and columns.
+
+    Returns:
+        ``(n, 2) float64``: column and row, pixel centres at ``+0.5``.
+    """
+    rows, columns = shape
+    column = (points[:, 0] / roi.length + 0.5) * columns
+    row = (0.5 - points[:, 1] / roi.width) * rows
+    return np.stack([column, row], axis=1)

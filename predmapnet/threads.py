@@ -1,0 +1,31 @@
+"""How many CPU threads the process uses, everywhere at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+
+def use_threads(count: int) -> int:
+    """Let PyTorch, numba and OpenCV use ``count`` threads each; 0 means all cores that this process may use.
+
+    Call it before they are imported where possible: thread pools that exist already can only shrink.
+
+    Returns:
+        The number of threads.
+    """
+    threads = count or available_cores()
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        if not (variable == "NUMBA_NUM_THREADS" and "numba" in sys.modules):
+            os.environ[variable] = str(threads)
+    import cv2
+    import torch
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    return threads
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
