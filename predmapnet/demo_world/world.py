@@ -85,6 +85,7 @@ class VectorMap:
         walkways: sidewalks; may be empty, then the dressing makes them up along the kerb.
         parking: parking bays (part of the road surface).
         stop_lines: polygons.
+        lane_paths: centre line ``(n, 2)`` of each lane in the direction of travel; empty where not known.
     """
 
     road_segments: tuple[Polygon, ...]
@@ -94,6 +95,7 @@ class VectorMap:
     walkways: tuple[Polygon, ...] = ()
     parking: tuple[Polygon, ...] = ()
     stop_lines: tuple[Polygon, ...] = ()
+    lane_paths: tuple[Float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -128,9 +130,12 @@ class Solids:
         size: ``(n, 3) float64``: length, width, height, metres.
         yaw: ``(n,) float64``, radians.
         colour: ``(n, 3) float64``, linear RGB in [0, 1].
-        texture: ``(n,)`` of ``plain``, ``facade``, ``vehicle``, ``foliage``, ``bark``.
+        texture: ``(n,)`` of ``plain``, ``facade``, ``vehicle``, ``foliage``, ``bark``, ``lamp`` (shines at night),
+            ``sign``.
         velocity: ``(n, 2) float64``, metres per second; moving vehicles follow a straight line around their
             position at the trajectory's first timestamp. Zero for what stands still.
+        lifetime: ``(n, 2) float64``, seconds since the first timestamp, between which a solid is there; None where
+            all of them always are. A vehicle in a bend is a chain of straight pieces, one after the other.
     """
 
     shape: NDArray[np.str_]
@@ -140,6 +145,14 @@ class Solids:
     colour: Float
     texture: NDArray[np.str_]
     velocity: Float
+    lifetime: Float | None = None
+
+    @property
+    def always(self) -> NDArray[np.bool_]:
+        """``(n,) bool``: which solids are there all the time."""
+        if self.lifetime is None:
+            return np.ones(len(self.shape), dtype=bool)
+        return np.asarray(np.isinf(self.lifetime).all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,26 @@
+"""How the inner loops are compiled: machine code that is kept between runs, on one thread each."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+if not os.access(Path(__file__).parent, os.W_OK) and not numba.config.CACHE_DIR:
+    # An installation that may not be written to: numba would refuse to cache where the home folder is sealed too.
+    numba.config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"predmapnet-numba-{os.getuid()}")
+
+
+def kernel(function: Function) -> Function:
+    """Compile ``function`` with numba; it releases the GIL, so threads render cameras side by side.
+
+    Infinities keep their meaning (depth of the sky), so only the harmless part of "fast math" is on.
+    """
+    options = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}}
+    return cast(Function, numba.njit(**options)(function))

@@ -1,0 +1,89 @@
+"""Light and weather: what each look means in numbers, varied from scene to scene."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from predmapnet.demo_world.world import Look
+
+Float32 = NDArray[np.float32]
+
+
+class Light(NamedTuple):
+    """The light of a scene; colours are ``(3,) float32`` linear RGB radiance, a white wall in the sun being about 1.
+
+    Attributes:
+        sun_direction: ``(3,) float32``, unit vector towards the sun, global frame.
+        sun: colour of direct light; zero without a sun.
+        ambient: light from the whole sky on a level surface.
+        zenith, horizon: colours of the sky.
+        cloud: colour of clouds.
+        cloud_cover: share of the sky under clouds, [0, 1].
+        haze: extinction per metre.
+        exposure: factor from radiance to sensor.
+        noise: standard deviation of the sensor's noise at middle grey, share of full scale.
+        wetness: 0 dry to 1 soaked.
+        headlights: strength of the ego car's lamps.
+        lit_windows: share of windows with light in them.
+        lamps: strength of street lamps and of other cars' lights.
+    """
+
+    sun_direction: Float32
+    sun: Float32
+    ambient: Float32
+    zenith: Float32
+    horizon: Float32
+    cloud: Float32
+    cloud_cover: float
+    haze: float
+    exposure: float
+    noise: float
+    wetness: float
+    headlights: float
+    lit_windows: float
+    lamps: float
+
+
+def _rgb(red: float, green: float, blue: float) -> Float32:
+    return np.array([red, green, blue], dtype=np.float32)
+
+
+def light_of(look: Look, seed: int) -> Light:
+    """Return the light of a scene: the look decides the kind, the seed the hour, clouds and exposure."""
+    generator = np.random.default_rng([seed, 101])
+    azimuth = generator.uniform(0, 2 * np.pi)
+    share = generator.uniform()
+    elevation = np.radians({Look.DAY: 28 + 30 * share, Look.DUSK: 6 + 8 * share}.get(look, 40.0))
+    direction = np.array(
+        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], dtype=np.float32
+    )
+    exposure = float(np.exp(generator.normal(0, 0.13)))
+    cover = float(generator.uniform(0.2, 0.75))
+    hazy = float(generator.uniform(0.0006, 0.0022))
+    if look is Look.DAY:
+        return Light(
+            direction, _rgb(1.9, 1.78, 1.55), _rgb(0.50, 0.60, 0.80), _rgb(0.22, 0.42, 0.85), _rgb(0.80, 0.92, 1.10),
+            _rgb(1.25, 1.25, 1.25), cover, hazy, 0.72 * exposure, 0.010, 0.0, 0.0, 0.02, 0.0,
+        )  # fmt: skip
+    if look is Look.DUSK:
+        return Light(
+            direction, _rgb(1.15, 0.66, 0.32), _rgb(0.26, 0.26, 0.34), _rgb(0.16, 0.20, 0.38), _rgb(0.95, 0.55, 0.32),
+            _rgb(0.70, 0.42, 0.38), cover, 1.5 * hazy, 0.95 * exposure, 0.018, 0.0, 0.25, 0.25, 0.35,
+        )  # fmt: skip
+    if look is Look.OVERCAST:
+        return Light(
+            direction, _rgb(0.0, 0.0, 0.0), _rgb(0.84, 0.88, 0.94), _rgb(0.78, 0.82, 0.88), _rgb(0.92, 0.94, 0.97),
+            _rgb(0.62, 0.65, 0.70), 0.95, 2.0 * hazy, 0.92 * exposure, 0.012, 0.0, 0.0, 0.06, 0.0,
+        )  # fmt: skip
+    if look is Look.WET:
+        return Light(
+            direction, _rgb(0.0, 0.0, 0.0), _rgb(0.50, 0.53, 0.58), _rgb(0.48, 0.51, 0.56), _rgb(0.62, 0.64, 0.67),
+            _rgb(0.38, 0.40, 0.44), 1.0, 4.0 * hazy, 1.12 * exposure, 0.016, 0.6 + 0.4 * share, 0.1, 0.15, 0.3,
+        )  # fmt: skip
+    return Light(
+        direction, _rgb(0.0, 0.0, 0.0), _rgb(0.012, 0.013, 0.020), _rgb(0.006, 0.008, 0.016), _rgb(0.035, 0.030, 0.030),
+        _rgb(0.02, 0.018, 0.018), cover, hazy, 2.1 * exposure, 0.045, 0.25 * float(share > 0.6), 1.0, 0.3, 1.0,
+    )  # fmt: skip
