@@ -106,7 +106,10 @@ class SceneInfo:
 class Georeference(Protocol):
     """From the metric global frame to WGS84; used by exporters only."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What the frame is called."""
+        ...
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
@@ -116,9 +119,20 @@ class Georeference(Protocol):
 class Scene(Protocol):
     """One driving log, opened."""
 
-    info: SceneInfo
-    rig: Rig
-    georeference: Georeference | None
+    @property
+    def info(self) -> SceneInfo:
+        """The scene's line in the listing."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """The car's cameras. Raises UserError for a log whose cameras are not known."""
+        ...
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where the global frame lies on Earth, if that is known."""
+        ...
 
     def __len__(self) -> int: ...
 
@@ -138,9 +152,20 @@ class Scene(Protocol):
 class SceneSource(Protocol):
     """A data set on disk (or the demo world, which makes itself)."""
 
-    name: str
-    root: Path
-    synthetic: bool
+    @property
+    def name(self) -> str:
+        """``nuscenes``, ``argoverse2`` or ``demo``."""
+        ...
+
+    @property
+    def root(self) -> Path:
+        """Where it lies."""
+        ...
+
+    @property
+    def synthetic(self) -> bool:
+        """Whether its images were rendered."""
+        ...
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List what is there, in the data set's order; ``split`` narrows it. Raises UserError."""

@@ -133,7 +133,7 @@ def _boxes_touch(polygons: Sequence[Polygon]) -> NDArray[np.bool_]:
     """``(n, n) bool``: whose bounding boxes meet."""
     low_x, low_y, high_x, high_y = shapely.bounds(polygons).T
     meet_x = (low_x[:, None] <= high_x[None]) & (low_x[None] <= high_x[:, None])
-    return meet_x & (low_y[:, None] <= high_y[None]) & (low_y[None] <= high_y[:, None])
+    return np.asarray(meet_x & (low_y[:, None] <= high_y[None]) & (low_y[None] <= high_y[:, None]))
 
 
 def _norm(vectors: Float) -> Float:

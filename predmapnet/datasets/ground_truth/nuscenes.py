@@ -23,6 +23,8 @@ from predmapnet.datasets.ground_truth.patch import (
     crossing_contours,
     cut_rings,
     keep_corners,
+    midpoint,
+    nearest_rows,
     parts_of_type,
     patch_polygon,
     rotation_about,
@@ -129,7 +131,7 @@ class NuScenesGroundTruth:
         dividers, divider_ids = self._layers["dividers"].cut(patch, "LineString", place)
         divider_lines = [shapely.get_coordinates(line) for line in dividers]
         boundaries = self._boundaries(patch, place, inner)
-        boundary_ids = self._boundary_ids([place.to_global(line) for line in boundaries])
+        boundary_ids = nearest_rows(self._ring_tree, [place.to_global(midpoint(line)[None])[0] for line in boundaries])
         groups = (crossings, divider_lines, boundaries)
         return FrameTruth(
             kinds=np.repeat([kind.value for kind in ElementKind], [len(group) for group in groups]).astype(np.int64),
@@ -196,14 +198,6 @@ class NuScenesGroundTruth:
     def _ring_tree(self) -> STRtree:
         return STRtree(self.rings)
 
-    def _boundary_ids(self, lines: list[Float]) -> list[int]:
-        """Index of the whole map's ring that each piece lies on."""
-        if not lines:
-            return []
-        middles = shapely.points([_midpoint(line) for line in lines])
-        nearest = self._ring_tree.query_nearest(middles, all_matches=False)
-        return [int(row) for row in nearest[1]]
-
 
 _TO_FORWARD_LEFT = rotation_about(-90, (0.0, 0.0))
 
@@ -216,10 +210,10 @@ class _Place:
         self._turn = turn
 
     def to_local(self, points: Float) -> Float:
-        return apply(self._turn, points) - self._centre
+        return np.asarray(apply(self._turn, points) - self._centre)
 
     def to_global(self, points: Float) -> Float:
-        return (points @ self._turn[:, :2]) + self._centre
+        return np.asarray(points @ self._turn[:, :2] + self._centre)
 
 
 class _Layer:
@@ -246,11 +240,6 @@ class _Layer:
 def truth_from_vector_map(vector_map: VectorMap) -> NuScenesGroundTruth:
     """Ground truth of a map of the demo world, without files."""
     return NuScenesGroundTruth.from_vector_map(vector_map)
-
-
-def _midpoint(line: Float) -> Float:
-    middle = len(line) // 2
-    return np.asarray((line[middle - 1] + line[middle]) / 2)
 
 
 def _read(path: Path) -> Mapping[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import LineString, Polygon
+from shapely import LineString, Polygon, STRtree
 
 Float = NDArray[np.float64]
 Geometries = NDArray[Any]
@@ -25,7 +25,7 @@ ROUNDING = 1e-6
 """Differences below this (metres, square metres) come from rounding."""
 
 
-def rotation_about(angle_degrees: float, centre: Sequence[float]) -> Float:
+def rotation_about(angle_degrees: float, centre: Sequence[float] | Float) -> Float:
     """Affine rotation about a point as ``(2, 3)``, with the exact zeros of right angles."""
     angle = angle_degrees * math.pi / 180.0
     cosine, sine = (0.0 if abs(value) < 2.5e-16 else value for value in (math.cos(angle), math.sin(angle)))
@@ -39,7 +39,7 @@ def apply(affine: Float, points: Float) -> Float:
     return np.stack([row[0] * x + row[1] * y + row[2] for row in affine], axis=1)
 
 
-def patch_polygon(centre: Sequence[float], extent_x: float, extent_y: float, angle_degrees: float) -> Polygon:
+def patch_polygon(centre: Sequence[float] | Float, extent_x: float, extent_y: float, angle_degrees: float) -> Polygon:
     """Rectangle around ``centre``, turned by ``angle_degrees``, in the frame of the map."""
     x, y = centre
     box = shapely.box(x - extent_x / 2.0, y - extent_y / 2.0, x + extent_x / 2.0, y + extent_y / 2.0)
@@ -147,3 +147,17 @@ def cut_rings(rings: Sequence[Any], region: Any) -> list[Float]:
         cut[row] = shapely.line_merge(shapely.multilinestrings(lines))
     lines, _ = parts_of_type(cut, "LineString")
     return [shapely.get_coordinates(line) for line in lines]
+
+
+def midpoint(line: Float) -> Float:
+    """Middle of the middle segment of a line: a point that lies on it."""
+    middle = len(line) // 2
+    return np.asarray((line[middle - 1] + line[middle]) / 2)
+
+
+def nearest_rows(tree: STRtree, points: Sequence[Float]) -> list[int]:
+    """Index of the geometry nearest to each point, the lowest of several."""
+    if not points or len(tree) == 0:
+        return [-1] * len(points)
+    query, rows = tree.query_nearest(shapely.points(np.array(points)))
+    return [int(rows[query == number].min()) for number in range(len(points))]

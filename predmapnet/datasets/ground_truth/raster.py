@@ -34,7 +34,7 @@ def to_pixels(points: Float, roi: RegionOfInterest, canvas: tuple[int, int] = CA
         ``(..., 2) float64``: column and row.
     """
     size = np.array(canvas)
-    return points * (size / roi.size) + size / 2
+    return np.asarray(points * (size / roi.size) + size / 2)
 
 
 def semantic_mask(
@@ -106,4 +106,5 @@ def mask_iou(first: Mask, second: Mask) -> Float:
     # float32 counts pixels exactly up to 2**24, and its product runs at full speed.
     together = (first.astype(np.float32) @ second.astype(np.float32).T).astype(np.float64)
     either = first.sum(axis=1)[:, None].astype(np.float64) + second.sum(axis=1)[None] - together
-    return np.divide(together, either, out=np.zeros_like(together), where=either > 0)
+    iou: Float = np.divide(together, either, out=np.zeros_like(together), where=either > 0)
+    return iou

@@ -83,8 +83,8 @@ def from_normalised(points: Float, roi: RegionOfInterest) -> Float:
         points: ``(..., 2)`` float32 or float64; the type is kept.
         roi: the region.
     """
-    size = roi.size.astype(points.dtype)
-    return points * size - size / 2
+    size: Float = roi.size.astype(points.dtype)
+    return np.asarray(points * size - size / 2)
 
 
 def warp(
@@ -107,7 +107,7 @@ def warp(
     before_to_now = inverse_pose(now.ego_to_global) @ before.ego_to_global
     moved = (lifted @ before_to_now.T)[..., :2].astype(np.float32)
     precise = moved if single_precision else moved.astype(np.float64)
-    size = roi.size.astype(precise.dtype)
+    size: Float = roi.size.astype(precise.dtype)
     clipped: Float = np.clip((precise + size / 2) / size, 0.0, 1.0)
     return clipped
 

@@ -29,7 +29,7 @@ def simplified(points: Float) -> Float:
     Returns:
         ``(k, 2) float64``.
     """
-    return shapely.get_coordinates(shapely.simplify(shapely.LineString(points), SIMPLIFICATION))
+    return np.asarray(shapely.get_coordinates(shapely.simplify(shapely.LineString(points), SIMPLIFICATION)))
 
 
 def resampled(points: Float, count: int = POINTS) -> Float:
