@@ -46,7 +46,8 @@ def consistency_average_precision(
     flags: list[Flags] = []
     for _, group in groupby(frames, key=lambda frame: frame.scene):
         scene = list(group)
-        flags += consistency_flags(scene, truth_track_ids(scene), thresholds, anchored)
+        matched = matched_tracks(scene, truth_track_ids(scene), thresholds)
+        flags += consistency_flags(scene, matched, anchored)
     return chamfer_from_flags(frames, flags, thresholds)
 
 
@@ -59,18 +60,30 @@ def with_formed_tracks(frames: Sequence[EvaluationFrame]) -> list[EvaluationFram
     return formed
 
 
+def matched_tracks(
+    frames: Sequence[EvaluationFrame], truth_ids: Sequence[Integer], thresholds: Thresholds = STANDARD_THRESHOLDS
+) -> list[Integer]:
+    """Find the true track of each tracked prediction, frame by frame.
+
+    Args:
+        frames: any frames.
+        truth_ids: per frame ``(m,)`` track ids of the truths, unique per kind.
+        thresholds: metres.
+
+    Returns:
+        Per frame ``(n, thresholds) int64``: track id of the truth that the prediction finds, or -1.
+    """
+    return [_matched_tracks(frame, ids, thresholds) for frame, ids in zip(frames, truth_ids, strict=True)]
+
+
 def consistency_flags(
-    frames: Sequence[EvaluationFrame],
-    truth_ids: Sequence[Integer],
-    thresholds: Thresholds = STANDARD_THRESHOLDS,
-    anchored: bool = True,
+    frames: Sequence[EvaluationFrame], matched: Sequence[Integer], anchored: bool = True
 ) -> list[Flags]:
     """Decide which predictions of one scene are true positives.
 
     Args:
         frames: all frames of the scene in order.
-        truth_ids: per frame ``(m,)`` track ids of the truths, unique per kind.
-        thresholds: metres.
+        matched: what :func:`matched_tracks` found in them.
         anchored: see :func:`consistency_average_precision`.
 
     Returns:
@@ -78,20 +91,18 @@ def consistency_flags(
     """
     owners: dict[tuple[int, int, int], int] = {}
     flags = []
-    for frame, ids in zip(frames, truth_ids, strict=True):
-        matched = _matched_tracks(frame, ids, thresholds)
+    for frame, found in zip(frames, matched, strict=True):
         kinds, tracks = frame.predicted.kinds, frame.predicted.track_ids
         counted = (tracks >= 0) & np.isin(kinds, frame.truth.kinds)
-        frame_flags = np.where(counted[:, None], matched >= 0, -1).astype(np.int8)
+        frame_flags = np.where(counted[:, None], found >= 0, -1).astype(np.int8)
         if anchored:
-            for column in range(len(thresholds)):
-                _anchor(np.flatnonzero(counted), kinds, tracks, matched[:, column], column, owners, frame_flags)
+            for column in range(found.shape[1]):
+                _anchor(np.flatnonzero(counted), kinds, tracks, found[:, column], column, owners, frame_flags)
         flags.append(frame_flags)
     return flags
 
 
 def _matched_tracks(frame: EvaluationFrame, truth_ids: Integer, thresholds: Thresholds) -> Integer:
-    """Track id of the truth that each prediction finds, ``(n, thresholds)``, or -1."""
     matched = np.full((len(frame.predicted), len(thresholds)), -1, dtype=np.int64)
     rows = np.flatnonzero(frame.predicted.track_ids >= 0)
     if len(rows) and len(truth_ids):

@@ -172,26 +172,25 @@ def write_frames(path: Path, scene: str, frame_maps: Sequence[FrameMap], provena
             writer.write(scene, index, frame_map)
 
 
-def read_frames(path: Path) -> StoredFrames:
+def stored_scenes(path: Path) -> tuple[str, ...]:
+    """Names of the scenes in a Parquet file of per-frame results, in order of appearance. Raises UserError."""
+    table = _open_table(path, columns=["scene"])
+    return tuple(dict.fromkeys(table.column("scene").to_pylist()))
+
+
+def read_frames(path: Path, scene: str | None = None) -> StoredFrames:
     """Read a Parquet file of per-frame results.
+
+    Args:
+        path: the file.
+        scene: read this scene only.
 
     Raises:
         UserError: the file does not exist, is a pickle, is damaged, or has another schema or version.
     """
-    table = _open_table(path)
-    metadata = table.schema.metadata or {}
-    version = metadata.get(_VERSION_KEY, b"").decode()
-    if version != str(SCHEMA_VERSION):
-        found = f"version {version}" if version else "no version"
-        raise UserError(
-            f"{path} is no per-frame result that this program reads: it has {found} in its metadata, "
-            f"version {SCHEMA_VERSION} is expected. Write it with 'predmapnet infer --save-frames'."
-        )
-    missing = sorted(set(_SCHEMA.names) - set(table.column_names))
-    if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; write it again with --save-frames.")
+    table = _open_table(path, filters=None if scene is None else [("scene", "=", scene)])
     frames = tuple(_frame_of(path, row) for row in table.to_pylist())
-    return StoredFrames(frames, json.loads(metadata.get(_PROVENANCE_KEY, b"{}")))
+    return StoredFrames(frames, json.loads((table.schema.metadata or {}).get(_PROVENANCE_KEY, b"{}")))
 
 
 def refuse_pickle(path: Path) -> None:
@@ -205,14 +204,30 @@ def refuse_pickle(path: Path) -> None:
         )
 
 
-def _open_table(path: Path) -> pa.Table:
+def _open_table(path: Path, **selection: Any) -> pa.Table:
+    """Read what is asked for, after the schema has been found to be ours."""
     if not path.is_file():
         raise UserError(f"There is no file {path}.")
     refuse_pickle(path)
     try:
-        return pq.read_table(path)
+        schema = pq.read_schema(path)
+        _check_schema(path, schema)
+        return pq.read_table(path, **selection)
     except (pa.ArrowException, OSError) as error:
         raise UserError(f"{path} cannot be read as Parquet: {error}. Is it complete?") from error
+
+
+def _check_schema(path: Path, schema: pa.Schema) -> None:
+    version = (schema.metadata or {}).get(_VERSION_KEY, b"").decode()
+    if version != str(SCHEMA_VERSION):
+        found = f"version {version}" if version else "no version"
+        raise UserError(
+            f"{path} is no per-frame result that this program reads: it has {found} in its metadata, "
+            f"version {SCHEMA_VERSION} is expected. Write it with 'predmapnet infer --save-frames'."
+        )
+    missing = sorted(set(_SCHEMA.names) - set(schema.names))
+    if missing:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; write it again with --save-frames.")
 
 
 def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:

@@ -5,7 +5,7 @@ import pytest
 
 from predmapnet.evaluation.chamfer_ap import chamfer_from_flags
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
-from predmapnet.evaluation.consistency_ap import consistency_flags
+from predmapnet.evaluation.consistency_ap import consistency_flags, matched_tracks
 from predmapnet.evaluation.tracks import form_tracks, truth_track_ids
 
 THRESHOLDS = (0.5, 1.0, 1.5)
@@ -62,7 +62,8 @@ def test_every_subset_has_the_official_average_precision(case, truth_ids, formed
     frames = frames_of_kind(case, formed, kind)
     flags, start = [], 0
     for scene in by_scene(case, frames):
-        flags += consistency_flags(scene, truth_ids[start : start + len(scene)], THRESHOLDS, mode == "stable")
+        matched = matched_tracks(scene, truth_ids[start : start + len(scene)], THRESHOLDS)
+        flags += consistency_flags(scene, matched, anchored=mode == "stable")
         start += len(scene)
     for subset, expected in case.expected["cmap"][kind][mode].items():
         rows = case.subset(subset)

@@ -10,7 +10,7 @@ import pytest
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
-from predmapnet.evaluation.frames_io import FrameWriter, read_frames, write_frames
+from predmapnet.evaluation.frames_io import FrameWriter, read_frames, stored_scenes, write_frames
 from predmapnet.evaluation.submission import read_submission
 
 
@@ -49,6 +49,17 @@ def test_frames_come_back_bit_by_bit(tmp_path):
             for line, other in zip(lines or (), expected or (), strict=True):
                 np.testing.assert_array_equal(line, other)
     assert [entry.name for entry in tmp_path.iterdir()] == ["frames.parquet"]
+
+
+def test_one_scene_of_many_is_read_alone(tmp_path):
+    path = tmp_path / "frames.parquet"
+    generator = np.random.default_rng(3)
+    with FrameWriter(path, {}) as writer:
+        for scene in ("b", "a"):
+            for index in range(2):
+                writer.write(scene, index, frame_map(2, generator), token=f"{scene}{index}")
+    assert stored_scenes(path) == ("b", "a")
+    assert [frame.token for frame in read_frames(path, "a").frames] == ["a0", "a1"]
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path):

@@ -1,0 +1,190 @@
+"""Everything that is measured of one scene, and of all scenes together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap
+from predmapnet.errors import UserError
+from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
+from predmapnet.evaluation.consistency_ap import consistency_flags, matched_tracks, with_formed_tracks
+from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
+from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.global_map import GlobalMapQuality, global_map_quality, pool, seen_area
+from predmapnet.evaluation.identity import IdentityCounts, count_identities, pool_identities
+from predmapnet.evaluation.precision_recall import AveragePrecision
+from predmapnet.evaluation.raster_ap import (
+    RasterAveragePrecision,
+    RasterMatches,
+    raster_from_matches,
+    raster_matches,
+)
+from predmapnet.evaluation.tracks import truth_track_ids
+
+Flags = NDArray[np.int8]
+
+
+@dataclass(frozen=True)
+class SceneMeasurement:
+    """What was decided element by element in one scene; figures come from pooling scenes.
+
+    Attributes:
+        frames: the frames that were measured, in order.
+        thresholds: chamfer thresholds, metres.
+        chamfer: per frame true-positive flags.
+        raster: per frame matches by overlap.
+        tracked, tracked_unanchored: per frame flags of C-mAP with the ids that the predictions carry, and the same
+            without asking for consistency.
+        formed_frames, formed: frames with ids formed from the predictions, and their flags.
+        identity: id switches and track lengths.
+        forecast: errors of the forecasts.
+        global_map: None where there is no global map or no true one.
+        mapping_seconds: wall time of mapping; None where results were read.
+    """
+
+    frames: tuple[EvaluationFrame, ...]
+    thresholds: tuple[float, ...]
+    chamfer: list[Flags]
+    raster: list[tuple[RasterMatches, ...]]
+    tracked: list[Flags]
+    tracked_unanchored: list[Flags]
+    formed_frames: list[EvaluationFrame]
+    formed: list[Flags]
+    identity: IdentityCounts
+    forecast: ForecastErrors
+    global_map: GlobalMapQuality | None
+    mapping_seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """All figures over all scenes."""
+
+    scenes: tuple[str, ...]
+    frames: tuple[EvaluationFrame, ...]
+    chamfer: AveragePrecision
+    raster: RasterAveragePrecision
+    consistency: AveragePrecision
+    consistency_unanchored: AveragePrecision
+    formed_consistency: AveragePrecision
+    identity: IdentityCounts
+    forecast: ForecastErrors
+    global_map: GlobalMapQuality | None
+    frames_per_second: float | None
+
+    @property
+    def has_tracks(self) -> bool:
+        """Whether any prediction carries a track id."""
+        return any((frame.predicted.track_ids >= 0).any() for frame in self.frames)
+
+    def figures(self) -> dict[str, Any]:
+        """Nested figures as written to JSON: ``chamfer_ap.mAP``, ``global_map.f1@1.0`` and so on.
+
+        ``consistency_ap`` uses the ids that the predictions carry, or formed ones where they carry none; its
+        ``ids`` says which.
+        """
+        formed = self.formed_consistency.figures()
+        if self.has_tracks:
+            consistency = self.consistency.figures() | {"ids": "tracker"}
+            consistency["mAP_without_consistency"] = self.consistency_unanchored.mean
+        else:
+            consistency = formed | {"ids": "formed"}
+        return {
+            "scenes": len(self.scenes),
+            "frames": len(self.frames),
+            "frames_per_second": self.frames_per_second,
+            "chamfer_ap": self.chamfer.figures(),
+            "consistency_ap": consistency,
+            "consistency_ap_formed_ids": formed,
+            "raster_ap": self.raster.figures(),
+            "global_map": None if self.global_map is None else self.global_map.figures(),
+            "forecast": self.forecast.figures(),
+            "tracks": self.identity.figures(),
+        }
+
+
+def measure_scene(
+    frames: Sequence[EvaluationFrame],
+    global_map: GlobalMap | None = None,
+    truth_map: GlobalMap | None = None,
+    mapping_seconds: float | None = None,
+) -> SceneMeasurement:
+    """Measure one scene.
+
+    Args:
+        frames: all frames of the scene in order.
+        global_map, truth_map: maps of the whole drive in the same global frame, if both exist.
+        mapping_seconds: wall time that mapping took, carried along.
+
+    Raises:
+        UserError: the scene has no frame.
+    """
+    if not frames:
+        raise UserError("There is no frame to measure.")
+    roi = frames[0].predicted.roi
+    thresholds = thresholds_for(roi)
+    truth_ids = truth_track_ids(frames)
+    matched = matched_tracks(frames, truth_ids, thresholds)
+    formed_frames = with_formed_tracks(frames)
+    quality = None
+    if global_map is not None and truth_map is not None:
+        seen = seen_area([frame.predicted.ego_to_global for frame in frames], roi)
+        quality = global_map_quality(global_map, truth_map, seen)
+    return SceneMeasurement(
+        frames=tuple(frames),
+        thresholds=thresholds,
+        chamfer=[frame_flags(frame, thresholds) for frame in frames],
+        raster=[raster_matches(frame) for frame in frames],
+        tracked=consistency_flags(frames, matched),
+        tracked_unanchored=consistency_flags(frames, matched, anchored=False),
+        formed_frames=formed_frames,
+        formed=consistency_flags(formed_frames, matched_tracks(formed_frames, truth_ids, thresholds)),
+        identity=count_identities(frames, truth_ids, [found[:, -1] for found in matched]),
+        forecast=forecast_errors(frames),
+        global_map=quality,
+        mapping_seconds=mapping_seconds,
+    )
+
+
+def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
+    """Put scenes together; their order decides equal scores.
+
+    Raises:
+        UserError: there is no scene, or the scenes were mapped with different regions of interest.
+    """
+    if not scenes:
+        raise UserError("There is no scene to measure.")
+    if len({scene.thresholds for scene in scenes}) > 1:
+        raise UserError("The scenes have regions of interest of different sizes; measure them apart.")
+    thresholds = scenes[0].thresholds
+    frames = [frame for scene in scenes for frame in scene.frames]
+    maps = [scene.global_map for scene in scenes if scene.global_map is not None]
+    seconds = [scene.mapping_seconds for scene in scenes if scene.mapping_seconds is not None]
+    return Measurement(
+        scenes=tuple(scene.frames[0].scene for scene in scenes),
+        frames=tuple(frames),
+        chamfer=chamfer_from_flags(frames, _flat([scene.chamfer for scene in scenes]), thresholds),
+        raster=raster_from_matches([match for scene in scenes for match in scene.raster]),
+        consistency=chamfer_from_flags(frames, _flat([scene.tracked for scene in scenes]), thresholds),
+        consistency_unanchored=chamfer_from_flags(
+            frames, _flat([scene.tracked_unanchored for scene in scenes]), thresholds
+        ),
+        formed_consistency=chamfer_from_flags(
+            [frame for scene in scenes for frame in scene.formed_frames],
+            _flat([scene.formed for scene in scenes]),
+            thresholds,
+        ),
+        identity=pool_identities([scene.identity for scene in scenes]),
+        forecast=pool_forecasts([scene.forecast for scene in scenes]),
+        global_map=pool(maps) if len(maps) == len(scenes) else None,
+        frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
+    )
+
+
+def _flat(flags: Sequence[list[Flags]]) -> list[Flags]:
+    return [entry for scene in flags for entry in scene]
