@@ -81,8 +81,10 @@ def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
     return ((images.float() - mean) / deviation).movedim(-1, -3)
 
 
-def preprocess_images(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Tensor, Tensor]:
-    """Prepare the images of one instant.
+def stack_windows(
+    images: Mapping[str, Image], rig: Rig, config: ImageConfig
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Cut the windows of one instant.
 
     Args:
         images: RGB uint8 images at their stored size, by camera name; cameras may be missing.
@@ -90,12 +92,24 @@ def preprocess_images(images: Mapping[str, Image], rig: Rig, config: ImageConfig
         config: the network's image size.
 
     Returns:
-        ``(N, 3, h, w) float32`` images and ``(N,) bool``, which of them are there; missing ones are black.
+        ``(N, h, w, 3) uint8`` windows, black where there is no image, and ``(N,) bool``, which cameras have one.
     """
     blank = np.zeros((config.height, config.width, 3), dtype=np.uint8)
     windows = [crop_image(images[camera.name], camera, config) if camera.name in images else blank for camera in rig]
-    valid = torch.tensor([camera.name in images for camera in rig])
-    return normalise_images(torch.from_numpy(np.stack(windows)), config), valid
+    return np.stack(windows), np.array([camera.name in images for camera in rig])
+
+
+def preprocess_images(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Tensor, Tensor]:
+    """Prepare the images of one instant for the network.
+
+    Args:
+        images, rig, config: as for :func:`stack_windows`.
+
+    Returns:
+        ``(N, 3, h, w) float32`` images and ``(N,) bool``, which of them are there.
+    """
+    windows, valid = stack_windows(images, rig, config)
+    return normalise_images(torch.from_numpy(windows), config), torch.from_numpy(valid)
 
 
 def mirror_rig(rig: Rig) -> Rig:

@@ -9,6 +9,7 @@ forward, y left.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -82,6 +83,19 @@ class StreamState:
     bev_memory: Tensor
     bev_memory_pose: Tensor
     bev_memory_valid: Tensor
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the state as named tensors, to be saved (safetensors) and read back by :meth:`from_tensors`."""
+        named = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return named | {f"instances.{name}": value for name, value in vars(self.instances).items()}
+
+    @classmethod
+    def from_tensors(cls, named: Mapping[str, Tensor]) -> StreamState:
+        """Make the state that :meth:`tensors` named."""
+        prefix = "instances."
+        instances = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
+        rest = {name: value for name, value in named.items() if not name.startswith(prefix)}
+        return cls(instances=Instances(**instances), **rest)
 
 
 @dataclass

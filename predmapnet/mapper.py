@@ -1,0 +1,250 @@
+"""Streaming inference: frames in, maps of single instants out, all memory in an explicit state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
+from predmapnet.config import PredMapNetConfig
+from predmapnet.datasets.images import read_image
+from predmapnet.datasets.source import Float, Frame, Image, Rig
+from predmapnet.errors import UserError
+from predmapnet.network.image_input import normalise_images, stack_windows
+from predmapnet.network.interface import FrameInputs, Instances, Selection, StreamState
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.tracking import select
+from predmapnet.network.view_transform import RigLookup
+from predmapnet.weights.checkpoint import load_checkpoint
+
+RIG_TOLERANCE = 1e-4
+"""Calibrations that differ by less (absolutely in metres, or relatively) share their look-up."""
+
+RIGS_KEPT = 8
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """Images of one instant as the network wants them.
+
+    Attributes:
+        windows: ``(N, h, w, 3) uint8``, RGB, in the order of the rig; black where there is no image.
+        valid: ``(N,) bool``.
+    """
+
+    windows: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+
+
+class Mapper:
+    """PredMapNet over a stream of frames.
+
+    It keeps nothing of a stream, so several logs can be mapped in turns, each with its own state.
+
+    Example:
+        >>> mapper = Mapper.from_checkpoint()  # doctest: +SKIP
+        >>> state = None
+        >>> for index in range(len(scene)):  # doctest: +SKIP
+        ...     frame_map, state = mapper.step(scene.frame(index), state)
+
+    Attributes:
+        config: of the network.
+        weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
+    """
+
+    def __init__(self, network: PredMapNet, device: str | torch.device = "cpu", weights_sha256: str = "") -> None:
+        self.network = network.to(device).eval()
+        self.config: PredMapNetConfig = network.config
+        self.weights_sha256 = weights_sha256
+        self._device = torch.device(device)
+        self._lookups: list[tuple[Rig, RigLookup]] = []
+
+    @classmethod
+    def from_checkpoint(cls, path: Path | None = None, device: str = "auto") -> Mapper:
+        """Load a network.
+
+        Args:
+            path: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
+            device: ``auto`` (a GPU if there is one), or as torch calls it.
+
+        Raises:
+            UserError: the weights or the device are not there.
+        """
+        checkpoint = load_checkpoint(path)
+        return cls(checkpoint.network, choose_device(device), checkpoint.sha256)
+
+    @property
+    def roi(self) -> RegionOfInterest:
+        """The region that is mapped at one instant."""
+        return self.config.roi
+
+    def read_images(self, frame: Frame, *, allow_missing_cameras: bool = False) -> CameraImages:
+        """Read and crop the images of a frame; safe to call from another thread while a step runs.
+
+        Args:
+            frame: names the images.
+            allow_missing_cameras: mask cameras without an image out instead of failing.
+
+        Raises:
+            UserError: an image is missing, damaged, or not of its camera's size.
+        """
+        images: dict[str, Image] = {}
+        for camera in frame.rig:
+            path = frame.images.get(camera.name)
+            if path is None or not path.exists():
+                if not allow_missing_cameras:
+                    raise UserError(_missing_camera(frame, camera.name, path))
+                continue
+            images[camera.name] = _of_size(read_image(path), camera.width, camera.height, path)
+        if not images:
+            raise UserError(
+                f"Frame {frame.index} of {frame.scene} has no image of any camera: there is nothing to map."
+            )
+        windows, valid = stack_windows(images, frame.rig, self.config.image)
+        return CameraImages(windows, valid)
+
+    @torch.no_grad()
+    def step(
+        self,
+        frame: Frame,
+        state: StreamState | None = None,
+        *,
+        images: CameraImages | None = None,
+        allow_missing_cameras: bool = False,
+    ) -> tuple[FrameMap, StreamState]:
+        """Map one frame.
+
+        Args:
+            frame: the next of its log.
+            state: what the step before returned; None begins a log.
+            images: what :meth:`read_images` returned for this frame, if it was called ahead; read here otherwise.
+            allow_missing_cameras: as in :meth:`read_images`.
+
+        Returns:
+            The map of this instant, and the state for the next step. ``state`` itself is not changed.
+
+        Raises:
+            UserError: an image is missing, damaged, or not of its camera's size.
+        """
+        if images is None:
+            images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
+        inputs = FrameInputs(
+            images=normalise_images(torch.from_numpy(images.windows)[None].to(self._device), self.config.image),
+            camera_valid=torch.from_numpy(images.valid)[None].to(self._device),
+            ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(self._device),
+        )
+        if state is None:
+            state = self.network.initial_state(1)
+        outputs = self.network(inputs, self._lookup(frame.rig), state)
+        selection = select(outputs, state, self.config)
+        state = self.network.advance(state, outputs, selection.instances, inputs)
+        return _frame_map(frame, selection, state, outputs.segmentation, self.config), state
+
+    def _lookup(self, rig: Rig) -> RigLookup:
+        """Return the look-up of a rig, from the few that were used last."""
+        for position, (known, lookup) in enumerate(self._lookups):
+            if known is rig or _same_rig(known, rig):
+                self._lookups.insert(0, self._lookups.pop(position))
+                return lookup
+        lookup = self.network.make_rig_lookup(rig)
+        self._lookups = [(rig, lookup), *self._lookups[: RIGS_KEPT - 1]]
+        return lookup
+
+
+def choose_device(name: str) -> torch.device:
+    """Turn the user's choice into a device.
+
+    Raises:
+        UserError: there is no such device here.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"The device '{name}' cannot be used ({reason}). Try --device cpu.") from None
+    return device
+
+
+def _same_rig(first: Rig, second: Rig) -> bool:
+    def looks(rig: Rig) -> list[tuple[str, int, int]]:
+        return [(camera.name, camera.width, camera.height) for camera in rig]
+
+    def close(one: Float, other: Float) -> bool:
+        return np.allclose(one, other, rtol=RIG_TOLERANCE, atol=RIG_TOLERANCE)
+
+    return looks(first) == looks(second) and all(
+        close(one.intrinsics, other.intrinsics) and close(one.camera_to_ego, other.camera_to_ego)
+        for one, other in zip(first, second, strict=True)
+    )
+
+
+def _missing_camera(frame: Frame, camera: str, path: Path | None) -> str:
+    expected = "the data set names no file for it" if path is None else f"{path} does not exist"
+    return (
+        f"Frame {frame.index} of {frame.scene} has no image of {camera}: {expected}. "
+        "Restore it, or map without it (--allow-missing-cameras)."
+    )
+
+
+def _of_size(image: Image, width: int, height: int, path: Path) -> Image:
+    if image.shape[:2] != (height, width):
+        raise UserError(
+            f"The image {path} has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"but the calibration of its camera is for {width} x {height}."
+        )
+    return image
+
+
+def _frame_map(
+    frame: Frame, selection: Selection, state: StreamState, segmentation: Tensor, config: PredMapNetConfig
+) -> FrameMap:
+    """Everything that is reported of one frame: tracks first, then detections without a track."""
+    tracks, others = _rows(selection.instances), _rows(selection.detections)
+    kinds = np.concatenate([tracks["labels"], others["labels"]])
+    points = np.concatenate([tracks["points"], others["points"]])
+    valid = selection.instances.valid[0]
+    forecasts: tuple[Float, ...] | None = None
+    if config.future.enabled:
+        nothing = np.zeros((0, 2))
+        forecasts = _to_metres(state.forecasts[0][valid].cpu().numpy(), tracks["labels"], config.roi)
+        forecasts += (nothing,) * len(others["labels"])
+    masks = None
+    if config.history_map.memory:
+        remembered = state.history_maps[0][valid].float().cpu().numpy()
+        masks = np.concatenate([remembered, np.zeros((len(others["labels"]), *config.mask_size), dtype=np.float32)])
+    return FrameMap(
+        timestamp=frame.timestamp,
+        ego_to_global=frame.ego_to_global,
+        roi=config.roi,
+        kinds=kinds,
+        scores=np.concatenate([tracks["scores"], others["scores"]]).astype(np.float64),
+        track_ids=np.concatenate([tracks["track_ids"], others["track_ids"]]),
+        polylines=_to_metres(points.clip(0.0, 1.0), kinds, config.roi),
+        forecasts=forecasts,
+        segmentation=segmentation[0].sigmoid().float().cpu().numpy(),
+        history_masks=masks,
+    )
+
+
+def _rows(instances: Instances) -> Mapping[str, NDArray[np.generic]]:
+    """Valid rows of the first stream, as arrays."""
+    valid = instances.valid[0]
+    names = ("labels", "points", "scores", "track_ids")
+    return {name: getattr(instances, name)[0][valid].cpu().numpy() for name in names}
+
+
+def _to_metres(points: NDArray[np.generic], kinds: NDArray[np.generic], roi: RegionOfInterest) -> tuple[Float, ...]:
+    """Turn normalised ``(n, P, 2)`` into ``n`` polylines in metres; crossings become closed rings."""
+    lines = (points.astype(np.float64) - 0.5) * roi.size
+    rings = kinds == ElementKind.PED_CROSSING
+    lines[rings, -1] = lines[rings, 0]
+    return tuple(lines)

@@ -1,0 +1,154 @@
+"""Checkpoints as safetensors files: the network's weights, its configuration, and how it was trained.
+
+Nothing is ever unpickled. The metadata of a file holds ``format``, ``version`` (of the package), ``configuration`` and
+``facts`` (free JSON: data, frames seen, scores).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from predmapnet import __version__
+from predmapnet.config import parse_config
+from predmapnet.errors import UserError
+from predmapnet.files import write_whole
+from predmapnet.network.predmapnet import PredMapNet
+
+SHIPPED = Path(__file__).with_name("lite.safetensors")
+"""The weights that come with the package."""
+
+FORMAT = "predmapnet-1"
+_SHOWN_NAMES = 4
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A network as read from a file.
+
+    Attributes:
+        network: in evaluation mode, on the CPU, float32.
+        facts: how it was trained.
+        version: of the package that wrote it.
+        sha256: of the file.
+    """
+
+    network: PredMapNet
+    facts: Mapping[str, Any]
+    version: str
+    sha256: str
+
+
+def save_checkpoint(
+    path: Path, network: PredMapNet, facts: Mapping[str, Any] | None = None, half: bool = False
+) -> None:
+    """Write a network; the file appears whole or not at all.
+
+    Args:
+        path: ends in ``.safetensors``.
+        network: whose weights and configuration are written.
+        facts: how it was trained, JSON types only.
+        half: store floating-point weights in 16 bits.
+    """
+    tensors = {}
+    for name, tensor in network.state_dict().items():
+        stored = tensor.half() if half and tensor.is_floating_point() else tensor
+        tensors[name] = stored.detach().cpu().contiguous()
+    metadata = {
+        "format": FORMAT,
+        "version": __version__,
+        "configuration": network.config.to_json(),
+        "facts": json.dumps(dict(facts or {})),
+    }
+    with write_whole(path) as temporary:
+        temporary.write_bytes(save(tensors, metadata))
+
+
+def load_checkpoint(path: Path | None = None) -> Checkpoint:
+    """Read a network.
+
+    Args:
+        path: a file that :func:`save_checkpoint` wrote; None for the shipped weights.
+
+    Raises:
+        UserError: the file is missing, damaged, from something else, or its weights do not fit its configuration.
+    """
+    path = _existing(path)
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path} is not a whole safetensors file ({error}). Fetch or write it again.") from None
+    if metadata.get("format") != FORMAT:
+        raise UserError(
+            f"{path} does not hold PredMapNet weights (its metadata has no format '{FORMAT}'). "
+            "Weights of other programs have to be imported first."
+        )
+    network = PredMapNet(parse_config(metadata["configuration"], str(path)))
+    _check_fit({name: tensor.shape for name, tensor in tensors.items()}, network, path)
+    network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
+    network.eval()
+    return Checkpoint(network, json.loads(metadata["facts"]), metadata["version"], weights_hash(path))
+
+
+def weights_hash(path: Path | None = None) -> str:
+    """Return the SHA-256 of a weights file in hex; None for the shipped weights.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    path = _existing(path)
+    stamp = path.stat()
+    return _hash(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@cache
+def _hash(path: Path, modified: int, size: int) -> str:
+    return sha256(path.read_bytes()).hexdigest()
+
+
+def _existing(path: Path | None) -> Path:
+    if path is None and not SHIPPED.is_file():
+        raise UserError(
+            "This installation has no lite.safetensors beside its code. "
+            "Install it again, or name a weights file (--weights FILE)."
+        )
+    path = SHIPPED if path is None else Path(path)
+    if not path.is_file():
+        raise UserError(f"There is no weights file {path}.")
+    return path
+
+
+def _full(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.float() if tensor.is_floating_point() else tensor
+
+
+def _check_fit(shapes: Mapping[str, torch.Size], network: PredMapNet, path: Path) -> None:
+    """Compare names and shapes with the network's, and name what does not fit."""
+    wanted = {name: tensor.shape for name, tensor in network.state_dict().items()}
+    faults = {
+        "missing": [name for name in wanted if name not in shapes],
+        "not known": [name for name in shapes if name not in wanted],
+        "of another shape": [
+            f"{name} {tuple(shapes[name])} instead of {tuple(shape)}"
+            for name, shape in wanted.items()
+            if name in shapes and shapes[name] != shape
+        ],
+    }
+    said = [
+        f"{len(names)} {what}: {', '.join(names[:_SHOWN_NAMES])}{' ...' if len(names) > _SHOWN_NAMES else ''}"
+        for what, names in faults.items()
+        if names
+    ]
+    if said:
+        raise UserError(f"The weights in {path} do not fit their configuration ({'; '.join(said)}).")
