@@ -13,6 +13,7 @@ from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
 from mapfusion.lines import Curve, Evidence, FusedLine
 from mapfusion.rings import FusedRing
+from mapfusion.tidy import closes, tidy
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
@@ -37,10 +38,13 @@ def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) ->
     points = smooth(curve, config)
     elements = []
     for start, stop in _stretches(odds > 0.0, int(config.max_gap / config.station_spacing)):
-        if stop - start < 2 or arc_length(points[start:stop])[-1] < config.min_length:
+        rows = start + tidy(points[start:stop])
+        if len(rows) < 2 or arc_length(points[rows])[-1] < config.min_length:
             continue
-        part, kept = _simplify(points[start:stop], config.simplify_tolerance)
-        deviation = 1.0 / np.sqrt(curve.information[start:stop][kept])
+        if closes(points[rows]):
+            rows = np.append(rows, rows[0])
+        part, kept = _simplify(points[rows], config.simplify_tolerance)
+        deviation = 1.0 / np.sqrt(curve.information[rows][kept])
         elements.append(_element(line.kind, part, float(expit(odds[start:stop]).mean()), line.evidence, deviation))
     return elements
 
@@ -49,21 +53,21 @@ def ring_elements(ring: FusedRing, views: ViewGrid, config: IntegratorConfig) ->
     """Return a crossing as an element, or nothing where the evidence is too little."""
     if ring.evidence.observations < config.min_observations:
         return []
-    held = np.argwhere(ring.share > 0.5)
-    if not len(held):
+    held = np.argwhere(ring.level() > 0)
+    outline = ring.outline(config.ring_cell)
+    if not len(held) or outline is None or outline.area < config.min_area:
         return []
     held = held[:: max(len(held) // 64, 1)]
-    seen_view = ring.seen_view[held[:, 0], held[:, 1]]
-    missed: Float = np.maximum(
-        views.at(np.asarray((held + ring.corner + 0.5) * config.ring_cell, dtype=np.float64)) - seen_view, 0.0
-    )
+    missed = views.at(np.asarray((held + ring.corner + 0.5) * config.ring_cell, dtype=np.float64))
+    missed = np.maximum(missed - ring.seen_view[held[:, 0], held[:, 1]], 0.0)
     odds = log_odds(np.array([ring.seen]), np.array([np.median(missed)]), config)[0]
-    outlines = ring.outlines(config.ring_cell)
-    if odds <= 0.0 or not outlines or outlines[0].area < 1.0:
+    if odds <= 0.0:
         return []
-    outline = shapely.simplify(outlines[0], config.simplify_tolerance)
-    points = shapely.get_coordinates(shapely.orient_polygons(outline))
-    return [_element(ring.kind, points, float(expit(odds)), ring.evidence, None)]
+    points = shapely.get_coordinates(shapely.orient_polygons(shapely.simplify(outline, config.simplify_tolerance)))
+    cells = np.floor(points / config.ring_cell).astype(np.int64) - ring.corner
+    looked = ring.looked[cells[:, 0].clip(0, ring.looked.shape[0] - 1), cells[:, 1].clip(0, ring.looked.shape[1] - 1)]
+    deviation = 1.0 / np.sqrt(np.maximum(looked.astype(np.float64), 1e-2))
+    return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation)]
 
 
 def smooth(curve: Curve, config: IntegratorConfig) -> Float:
@@ -106,7 +110,7 @@ def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]
     """Simplify a line; returns its points and which of the given ones they are."""
     simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), tolerance))
     lookup = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
-    return simple, np.array([lookup[point] for point in map(tuple, simple.tolist())])
+    return simple, np.array([lookup[point] for point in map(tuple, simple.tolist())], dtype=np.int64)
 
 
 def _element(

@@ -11,7 +11,7 @@ class IntegratorConfig:
 
     Attributes:
         station_spacing: distance between the vertices that carry the evidence of a line, metres.
-        ring_cell: cell of the occupancy grid in which crossings are fused, metres.
+        ring_cell: cell of the signed-distance grid in which crossings are fused, metres.
         deviation_near: standard deviation of a detection across the line beside the car, metres.
         deviation_per_metre: its growth with the distance from the car, metres per metre.
         match_distance: largest mean lateral distance at which a detection can be an element, metres.
@@ -19,7 +19,7 @@ class IntegratorConfig:
         match_overlap: shortest common stretch that identifies a line, metres (less for shorter lines).
         merge_distance: elements of one kind closer than this on average are one, unless single frames show both,
             metres.
-        ring_overlap: smallest share of the smaller of two crossings that must be common to match.
+        ring_overlap: smallest intersection over union at which two crossings match.
         rim: stations closer than this to the rim of the ROI do not count as looked at, metres.
         view_full, view_far, view_floor: up to ``view_full`` metres from the car a missing detection counts fully;
             the weight falls linearly to ``view_floor`` at ``view_far`` metres.
@@ -27,6 +27,7 @@ class IntegratorConfig:
         hit_log_odds, miss_log_odds: what one sighting adds and one missed sighting takes.
         min_observations: elements seen in fewer frames are left out of the map.
         min_length: shorter lines are left out of the map, metres.
+        min_area: smaller crossings are left out of the map, square metres.
         max_gap: stretches without evidence up to this length are bridged inside a line, metres.
         curvature_deviation: expected second difference of a line's vertices one metre apart, metres; smaller is
             smoother.
@@ -36,14 +37,14 @@ class IntegratorConfig:
     """
 
     station_spacing: float = 1.0
-    ring_cell: float = 0.25
+    ring_cell: float = 0.5
     deviation_near: float = 0.15
     deviation_per_metre: float = 0.35 / 30.0
     match_distance: float = 1.2
     match_angle: float = 35.0
     match_overlap: float = 3.0
     merge_distance: float = 0.6
-    ring_overlap: float = 0.35
+    ring_overlap: float = 0.3
     rim: float = 1.5
     view_full: float = 12.0
     view_far: float = 30.0
@@ -53,6 +54,7 @@ class IntegratorConfig:
     miss_log_odds: float = 0.7
     min_observations: int = 2
     min_length: float = 2.0
+    min_area: float = 2.0
     max_gap: float = 4.0
     curvature_deviation: float = 0.1
     simplify_tolerance: float = 0.05

@@ -15,7 +15,17 @@ from mapfusion.journal import Journal
 from mapfusion.lines import Curve, Evidence, FusedLine, beside, fuse
 from mapfusion.matching import Correspondence
 from mapfusion.observations import Observation, observe, pose_problem
-from mapfusion.rings import FusedRing, RingSighting, common_share, fuse_ring, merge_rings, new_ring, sight
+from mapfusion.rings import (
+    FusedRing,
+    RingSighting,
+    fuse_ring,
+    merge_rings,
+    new_ring,
+    overlap,
+    ring_match_threshold,
+    room_of,
+    sight,
+)
 from mapfusion.spatial import TileIndex
 from mapfusion.views import ViewGrid
 
@@ -148,11 +158,7 @@ class MapIntegrator:
     ) -> list[Curve]:
         line = self.lines[element]
         line.curve, pieces = fuse(line.curve, _curve(observation), match)
-        evidence = line.evidence
-        evidence.first_seen = min(evidence.first_seen, timestamp)
-        evidence.last_seen = max(evidence.last_seen, timestamp)
-        evidence.observations += not again
-        evidence.tracks[observation.track_id] = evidence.tracks.get(observation.track_id, 0) + 1
+        line.evidence.sighted(observation.track_id, timestamp, again)
         self.index.put(element, line.curve.points)
         self._dirty.add(element)
         return pieces
@@ -196,45 +202,47 @@ class MapIntegrator:
                 self.next_id += 1
 
     def _add_rings(self, observations: list[Observation], near: list[int], frame_map: FrameMap) -> None:
-        options: list[dict[int, tuple[float, RingSighting]]] = []
         cell = self.config.ring_cell
-        for observation in observations:
-            row: dict[int, tuple[float, RingSighting]] = {}
-            for element in near:
-                ring = self.rings[element]
-                box_low, box_high = ring.corner * cell, ring.stop * cell
-                if (observation.points.max(axis=0) < box_low).any() or (
-                    observation.points.min(axis=0) > box_high
-                ).any():
-                    continue
-                sighting = sight(observation, (ring.corner, ring.stop), frame_map.ego_to_global, frame_map.roi, cell)
-                common = common_share(ring, sighting)
-                if common > self.config.ring_overlap:
-                    row[element] = (common, sighting)
-            options.append(row)
-        chosen = assign([{element: common for element, (common, _) in row.items()} for row in options])
-        for observation, row, match in zip(observations, options, chosen, strict=True):
-            if match is None:
-                sighting = sight(observation, None, frame_map.ego_to_global, frame_map.roi, cell)
-                self.rings[self.next_id] = new_ring(sighting, frame_map.timestamp)
+        rooms = [room_of(observation.points, cell) for observation in observations]
+        sightings: list[RingSighting] = []
+        options: list[dict[int, float]] = []
+        for observation, (low, high) in zip(observations, rooms, strict=True):
+            around = [i for i in near if (self.rings[i].corner < high).all() and (self.rings[i].stop > low).all()]
+            wide_low = np.min([low, *(self.rings[i].corner for i in around)], axis=0)
+            wide_high = np.max([high, *(self.rings[i].stop for i in around)], axis=0)
+            sighting = sight(observation, (wide_low, wide_high), frame_map.ego_to_global, frame_map.roi, cell)
+            shares = {i: overlap(self.rings[i], sighting) for i in around}
+            sightings.append(sighting)
+            options.append(
+                {i: s for i, s in shares.items() if s > ring_match_threshold(self.rings[i], observation, self.config)}
+            )
+        chosen = assign(options)
+        for sighting, (low, high), row, element in zip(sightings, rooms, options, chosen, strict=True):
+            if element is None:
+                self.rings[self.next_id] = new_ring(sighting.crop(low, high), frame_map.timestamp)
                 self._file_ring(self.next_id)
                 self.next_id += 1
                 continue
-            element = match
             ring = self.rings[element]
-            fuse_ring(ring, row[element][1])
-            evidence = ring.evidence
-            evidence.first_seen = min(evidence.first_seen, frame_map.timestamp)
-            evidence.last_seen = max(evidence.last_seen, frame_map.timestamp)
-            evidence.observations += 1
-            evidence.tracks[observation.track_id] = evidence.tracks.get(observation.track_id, 0) + 1
+            room = np.minimum(low, ring.corner), np.maximum(high, ring.stop)
+            fuse_ring(ring, sighting.crop(*room), frame_map.timestamp)
+            for other in row:
+                if other != element and other not in chosen and other in self.rings:
+                    self._merge_rings(element, other)
             self._file_ring(element)
-            for other, (common, _) in row.items():
-                if other != element and other not in chosen and common > 0.5 and other in self.rings:
-                    merge_rings(ring, self.rings.pop(other))
-                    self.index.remove(other)
-                    self._dirty.add(other)
-                    self._file_ring(element)
+
+    def _merge_rings(self, keep: int, drop: int) -> None:
+        """Make one crossing of two that cover much the same ground."""
+        first, second = self.rings[keep], self.rings[drop]
+        low, high = np.maximum(first.corner, second.corner), np.minimum(first.stop, second.stop)
+        if (high <= low).any():
+            return
+        one, two = first.level(first.window(low, high)) > 0, second.level(second.window(low, high)) > 0
+        if np.count_nonzero(one & two) < self.config.ring_overlap * np.count_nonzero(one | two):
+            return
+        merge_rings(first, self.rings.pop(drop))
+        self.index.remove(drop)
+        self._dirty.add(drop)
 
     def _file_ring(self, element: int) -> None:
         ring = self.rings[element]

@@ -28,6 +28,13 @@ class Evidence:
     beside: dict[int, int] = field(default_factory=dict)
     """Element id to the number of frames that showed it beside this one."""
 
+    def sighted(self, track_id: int, timestamp: int, again: bool = False) -> None:
+        """Count one frame of a track; ``again`` where another observation of the same frame was counted."""
+        self.first_seen = min(self.first_seen, timestamp)
+        self.last_seen = max(self.last_seen, timestamp)
+        self.observations += not again
+        self.tracks[track_id] = self.tracks.get(track_id, 0) + 1
+
     def absorb(self, other: Evidence) -> None:
         """Add what is known of an element that turned out to be this one."""
         self.first_seen = min(self.first_seen, other.first_seen)

@@ -1,4 +1,4 @@
-"""A crossing of the map: an occupancy grid that holds how often each cell lay inside its observed rings."""
+"""A crossing of the map: a grid of averaged signed distances to its observed rings."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.config import IntegratorConfig
 from mapfusion.contour import level_polygons
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose, transform_points
@@ -17,29 +18,35 @@ from mapfusion.observations import Observation
 Float = NDArray[np.float64]
 Grid = NDArray[np.float32]
 Integer = NDArray[np.int64]
+Window = tuple[slice, slice]
 
-MARGIN = 1.5
-"""Room around a ring when its grid is made, metres."""
+TRUNCATION = 1.5
+"""Signed distances are cut off here, so that one wrong ring moves the mean little, metres."""
+
+CUT_RIM = 0.75
+"""Edges of a ring this close to the rim of the ROI were cut by it and say nothing, metres."""
 
 
 @dataclass
 class FusedRing:
     """A crossing of the map, as sums over the observations per cell of a lattice common to the whole map.
 
-    The share ``inside / looked`` of a cell does not depend on the order of observations, nor on where a ring starts
-    or which way it runs; its outline at one half is the median of the observed rings (Vorob'ev). Cells outside the
-    ROI of an observation count neither way, so an end that the ROI has cut is not an end.
+    Truncated signed distances are averaged cell by cell (Curless and Levoy, SIGGRAPH 1996) and the fused outline is
+    where their mean is zero. The sums do not depend on the order of observations, nor on where a ring starts or
+    which way it runs; cells that an observation could not see count neither way, so an end that the ROI has cut is
+    not an end.
 
     Attributes:
         corner: ``(2,) int64``, lattice index of the first cell.
-        inside: ``(rows, columns) float32``, information of the observations that hold the cell inside.
-        looked: the same of all observations that had the cell in their ROI.
+        distance: ``(rows, columns) float32``, sum of information times signed distance, positive inside, 1 / m.
+        looked: sum of information of the observations that could see the cell, 1 / m².
         seen_view: sum of the view weights of the observations.
         seen: sum of sightings, weighted by score.
+        evidence: times, tracks and counts.
     """
 
     corner: Integer
-    inside: Grid
+    distance: Grid
     looked: Grid
     seen_view: Grid
     seen: float
@@ -47,126 +54,188 @@ class FusedRing:
     kind: ElementKind = ElementKind.PED_CROSSING
 
     @property
-    def share(self) -> Grid:
-        """``(rows, columns) float32`` in ``[0, 1]``: how surely each cell belongs to the crossing."""
-        return np.divide(self.inside, np.maximum(self.looked, 1e-6), dtype=np.float32)
-
-    @property
     def stop(self) -> Integer:
         """Lattice index past the last cell, ``(2,)``."""
-        return self.corner + self.inside.shape
+        return self.corner + self.looked.shape
+
+    def level(self, window: Window = (slice(None), slice(None))) -> Grid:
+        """Return the mean signed distance, metres, positive inside; cells never seen count as outside."""
+        looked = self.looked[window]
+        mean = np.full(looked.shape, -TRUNCATION, dtype=np.float32)
+        return np.divide(self.distance[window], looked, out=mean, where=looked > 0)
 
     def grow(self, corner: Integer, stop: Integer) -> None:
-        """Make room for cells ``corner`` to ``stop``; new cells have been looked at as often as their neighbours."""
+        """Make room for cells ``corner`` to ``stop``; new ones were seen outside as often as their neighbours."""
         low, high = np.minimum(corner, self.corner), np.maximum(stop, self.stop)
         before, after = self.corner - low, high - self.stop
         if not (before.any() or after.any()):
             return
-        width = ((before[0], after[0]), (before[1], after[1]))
-        self.inside = np.pad(self.inside, width)
-        self.looked = np.pad(self.looked, width, mode="edge")
+        width = ((int(before[0]), int(after[0])), (int(before[1]), int(after[1])))
+        inner = tuple(slice(a, a + n) for a, n in zip(before.tolist(), self.looked.shape, strict=True))
+        looked = np.pad(self.looked, width, mode="edge")
+        distance = -np.float32(TRUNCATION) * looked
+        distance[inner] = self.distance
+        self.looked, self.distance = looked, distance
         self.seen_view = np.pad(self.seen_view, width, mode="edge")
         self.corner = low
 
-    def outlines(self, cell: float) -> list[shapely.Polygon]:
-        """Return the fused outlines in the global frame, largest first."""
-        polygons = level_polygons(self.share.astype(np.float64), 0.5)
-        return [shapely.Polygon((shapely.get_coordinates(p) + self.corner + 0.5) * cell) for p in polygons]
+    def window(self, corner: Integer, stop: Integer) -> Window:
+        """Return the part of the grid that holds cells ``corner`` to ``stop``."""
+        a, b = (corner - self.corner).tolist(), (stop - self.corner).tolist()
+        return slice(a[0], b[0]), slice(a[1], b[1])
+
+    def outline(self, cell: float) -> shapely.Polygon | None:
+        """Return the largest fused outline in the global frame, or None."""
+        polygons = level_polygons(self.level().astype(np.float64), 0.0)
+        if not polygons:
+            return None
+        return shapely.Polygon((shapely.get_coordinates(polygons[0]) + self.corner + 0.5) * cell)
 
 
 @dataclass(frozen=True)
 class RingSighting:
-    """An observed ring on the lattice; attributes as in :class:`FusedRing`, of one frame."""
+    """An observed ring on the lattice.
+
+    Attributes:
+        observation: the ring.
+        corner: ``(2,) int64``, lattice index of the first cell.
+        distance: ``(rows, columns) float32``, signed distance, metres, positive inside, truncated.
+        visible: ``(rows, columns) bool``, cells inside the ROI and clear of its rim.
+    """
 
     observation: Observation
     corner: Integer
-    inside: NDArray[np.bool_]
-    information: Grid
-    view: Grid
+    distance: Grid
+    visible: NDArray[np.bool_]
 
     @property
     def stop(self) -> Integer:
         """Lattice index past the last cell, ``(2,)``."""
-        return self.corner + self.inside.shape
+        return self.corner + self.visible.shape
+
+    def crop(self, corner: Integer, stop: Integer) -> RingSighting:
+        """Return the part that holds cells ``corner`` to ``stop``."""
+        (a, b), (c, d) = (corner - self.corner).tolist(), (stop - self.corner).tolist()
+        return RingSighting(self.observation, corner, self.distance[a:c, b:d], self.visible[a:c, b:d])
+
+
+def room_of(points: Float, cell: float) -> tuple[Integer, Integer]:
+    """Return the first cell and past the last that a ring ``(n, 2)`` and the truncation around it need."""
+    low = np.floor((points.min(axis=0) - TRUNCATION) / cell).astype(np.int64)
+    high = np.floor((points.max(axis=0) + TRUNCATION) / cell).astype(np.int64) + 1
+    return low, high
 
 
 def sight(
-    observation: Observation, room: tuple[Integer, Integer] | None, pose: Float, roi: RegionOfInterest, cell: float
+    observation: Observation,
+    room: tuple[Integer, Integer],
+    pose: Float,
+    roi: RegionOfInterest,
+    cell: float,
 ) -> RingSighting:
     """Put an observed ring on the lattice.
 
     Args:
         observation: a ring in the global frame.
-        room: first cell and past the last of the ring of the map that it may belong to; None for the
-            observation's own box and a margin.
+        room: first cell and past the last; holds at least the observation's own room.
         pose: ``ego_to_global`` of the frame.
         roi: what was looked at.
         cell: lattice constant, metres.
     """
-    low = np.floor((observation.points.min(axis=0) - MARGIN) / cell).astype(np.int64)
-    high = np.floor((observation.points.max(axis=0) + MARGIN) / cell).astype(np.int64) + 1
-    if room is not None:
-        low, high = np.minimum(low, room[0]), np.maximum(high, room[1])
-    x, y = np.meshgrid(*(np.arange(low[axis], high[axis]) + 0.5 for axis in range(2)), indexing="ij")
-    centres = np.stack([x, y], axis=-1).reshape(-1, 2) * cell
-    polygon = shapely.Polygon(observation.points)
-    shapely.prepare(polygon)
-    inside = shapely.contains_xy(polygon, centres[:, 0], centres[:, 1])
-    ego = np.abs(transform_points(inverse_pose(pose), centres))
-    in_roi = (ego < roi.size / 2 - cell / 2).all(axis=1)
-    shape = x.shape
-    information = np.where(in_roi, observation.information.mean(), 0.0).astype(np.float32)
-    view = np.where(in_roi, observation.view.mean(), 0.0).astype(np.float32)
-    return RingSighting(
-        observation, low, (inside & in_roi).reshape(shape), information.reshape(shape), view.reshape(shape)
-    )
+    low, high = room
+    own_low, own_high = room_of(observation.points, cell)
+    global_to_ego = inverse_pose(pose)
+    x, y = ((np.arange(low[axis], high[axis]) + 0.5) * cell for axis in range(2))
+    axes, origin = global_to_ego[:2, :2], global_to_ego[:2, 3]
+    forward = np.abs(x[:, None] * axes[0, 0] + y[None, :] * axes[0, 1] + origin[0])
+    left = np.abs(x[:, None] * axes[1, 0] + y[None, :] * axes[1, 1] + origin[1])
+    visible = (forward < roi.length / 2 - CUT_RIM) & (left < roi.width / 2 - CUT_RIM)
+    distance = np.full(visible.shape, -TRUNCATION, dtype=np.float32)
+    (a, b), (c, d) = (own_low - low).tolist(), (own_high - low).tolist()
+    rim = roi.size / 2 - CUT_RIM
+    local = transform_points(global_to_ego, observation.points) / rim
+    cut = ((local[:-1] > 1) & (local[1:] > 1)) | ((local[:-1] < -1) & (local[1:] < -1))
+    distance[a:c, b:d] = _signed_distance(x[a:c], y[b:d], observation.points, np.asarray(~cut.any(axis=1)))
+    return RingSighting(observation, low, distance, visible)
+
+
+def _signed_distance(x: Float, y: Float, ring: Float, counts: NDArray[np.bool_]) -> Grid:
+    """Return the truncated signed distance from cells to a ring; edges that do not count bound, but are not near.
+
+    Args:
+        x: ``(rows,)``, metres.
+        y: ``(columns,)``, metres.
+        ring: ``(n + 1, 2)``, closed.
+        counts: ``(n,)``, which edges distances are taken to.
+    """
+    origin = np.array([x[0], y[0]])
+    start, stop = (ring[:-1] - origin).astype(np.float32), (ring[1:] - origin).astype(np.float32)
+    px = (x - origin[0]).astype(np.float32)[:, None, None]
+    py = (y - origin[1]).astype(np.float32)[None, :, None]
+    # even-odd rule along rows; the abscissa of an edge at height y depends on y alone
+    rise = np.where(stop[:, 1] == start[:, 1], np.float32(1e-6), stop[:, 1] - start[:, 1])
+    crossed = (start[:, 1] > py[0]) != (stop[:, 1] > py[0])
+    abscissa = start[:, 0] + (py[0] - start[:, 1]) / rise * (stop[:, 0] - start[:, 0])
+    inside = np.count_nonzero(crossed & (px < abscissa), axis=2) % 2 == 1
+    if not counts.any():
+        return np.where(inside, np.float32(TRUNCATION), np.float32(-TRUNCATION))
+    first, edge = start[counts], (stop - start)[counts]
+    square = np.maximum((edge**2).sum(axis=1), np.float32(1e-9))
+    dx, dy = px - first[:, 0], py - first[:, 1]
+    along = np.clip((dx * edge[:, 0] + dy * edge[:, 1]) / square, 0, 1)
+    nearest = np.sqrt(((dx - along * edge[:, 0]) ** 2 + (dy - along * edge[:, 1]) ** 2).min(axis=2))
+    nearest = np.minimum(nearest, np.float32(TRUNCATION))
+    return np.asarray(np.where(inside, nearest, -nearest), dtype=np.float32)
 
 
 def new_ring(sighting: RingSighting, timestamp: int) -> FusedRing:
     """Start a crossing from its first observation."""
-    observation = sighting.observation
-    return FusedRing(
-        corner=sighting.corner,
-        inside=np.where(sighting.inside, sighting.information, np.float32(0)),
-        looked=sighting.information.copy(),
-        seen_view=sighting.view.copy(),
-        seen=observation.sighting,
-        evidence=Evidence(timestamp, timestamp, tracks={observation.track_id: 1}),
+    zero = np.zeros(sighting.visible.shape, dtype=np.float32)
+    tracks = {sighting.observation.track_id: 0}
+    ring = FusedRing(
+        sighting.corner, zero, zero.copy(), zero.copy(), 0.0, Evidence(timestamp, timestamp, 0, tracks=tracks)
     )
+    fuse_ring(ring, sighting, timestamp)
+    return ring
 
 
-def fuse_ring(ring: FusedRing, sighting: RingSighting) -> None:
-    """Add an observation to a crossing, in place; the sighting was made with the ring's room."""
+def fuse_ring(ring: FusedRing, sighting: RingSighting, timestamp: int) -> None:
+    """Add an observation to a crossing, in place."""
+    observation = sighting.observation
     ring.grow(sighting.corner, sighting.stop)
-    start = sighting.corner - ring.corner
-    window = tuple(slice(a, a + n) for a, n in zip(start, sighting.inside.shape, strict=True))
-    ring.inside[window] += np.where(sighting.inside, sighting.information, np.float32(0))
-    ring.looked[window] += sighting.information
-    ring.seen_view[window] += sighting.view
-    ring.seen += sighting.observation.sighting
+    window = ring.window(sighting.corner, sighting.stop)
+    information = sighting.visible * np.float32(observation.information.mean())
+    ring.distance[window] += information * sighting.distance
+    ring.looked[window] += information
+    ring.seen_view[window] += sighting.visible * np.float32(observation.view.mean())
+    ring.seen += observation.sighting
+    ring.evidence.sighted(observation.track_id, timestamp)
 
 
 def merge_rings(ring: FusedRing, other: FusedRing) -> None:
     """Add all of another crossing to this one, in place."""
     ring.grow(other.corner, other.stop)
     other.grow(ring.corner, ring.stop)
-    ring.inside = ring.inside + other.inside
+    ring.distance = ring.distance + other.distance
     ring.looked = ring.looked + other.looked
     ring.seen_view = ring.seen_view + other.seen_view
     ring.seen += other.seen
     ring.evidence.absorb(other.evidence)
 
 
-def common_share(ring: FusedRing, sighting: RingSighting) -> float:
-    """Return the common area over the smaller of both, as far as the frame could see them."""
+def overlap(ring: FusedRing, sighting: RingSighting) -> float:
+    """Return intersection over union of a crossing and an observed ring, where the frame and the map both know."""
     low, high = np.maximum(ring.corner, sighting.corner), np.minimum(ring.stop, sighting.stop)
     if (high <= low).any():
         return 0.0
-    a, b = low - ring.corner, high - ring.corner
-    c, d = low - sighting.corner, high - sighting.corner
-    held = ring.share[a[0] : b[0], a[1] : b[1]] > 0.5
-    seen = sighting.inside[c[0] : d[0], c[1] : d[1]]
-    visible = held & (sighting.information[c[0] : d[0], c[1] : d[1]] > 0)
-    common = float((held & seen).sum())
-    smaller = min(float(sighting.inside.sum()), float(visible.sum()))
-    return common / smaller if smaller > 0 else 0.0
+    seen = sighting.crop(low, high)
+    window = ring.window(low, high)
+    known = seen.visible & (ring.looked[window] > 0)
+    held, inside = (ring.distance[window] > 0) & known, (seen.distance > 0) & known
+    union = np.count_nonzero(held | inside)
+    return float(np.count_nonzero(held & inside)) / union if union else 0.0
+
+
+def ring_match_threshold(ring: FusedRing, observation: Observation, config: IntegratorConfig) -> float:
+    """Return the overlap that a match takes: less where the track is known."""
+    return config.ring_overlap * (0.5 if observation.track_id in ring.evidence.tracks else 1.0)

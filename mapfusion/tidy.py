@@ -1,0 +1,69 @@
+"""Lines as a user expects them: no spikes, no loops, closed where they come back to their start."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+SPIKE_COSINE = np.cos(np.radians(120.0))
+"""A line that turns by more than this between two stations folds back on itself."""
+
+CLOSING_GAP = 2.0
+"""Ends of one line this close, running into each other, are one place, metres."""
+
+
+def tidy(points: Float) -> Integer:
+    """Choose the vertices of a line that remain when spikes and loops are taken out.
+
+    Args:
+        points: ``(n, 2)``, metres.
+
+    Returns:
+        Ascending rows of ``points``.
+    """
+    rows = np.arange(len(points))
+    for _ in range(len(points)):
+        spikes = _spikes(points[rows])
+        if not len(spikes):
+            break
+        rows = np.delete(rows, spikes[:1])
+    while len(rows) > 3 and not shapely.is_simple(shapely.LineString(points[rows])):
+        loop = _first_loop(points[rows])
+        if loop is None:
+            break
+        rows = np.delete(rows, np.arange(loop[0] + 1, loop[1] + 1))
+    return rows
+
+
+def closes(points: Float) -> bool:
+    """Whether a line of at least 8 m comes back to its start and runs into it."""
+    gap = points[0] - points[-1]
+    distance = float(np.linalg.norm(gap))
+    if len(points) < 8 or distance > CLOSING_GAP:
+        return False
+    leave, arrive = points[1] - points[0], points[-1] - points[-2]
+    return bool(leave @ arrive > 0.0 and (distance < 0.3 or (gap @ leave > 0.0 and gap @ arrive > 0.0)))
+
+
+def _spikes(points: Float) -> Integer:
+    step = np.diff(points, axis=0)
+    length = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    cosine = (step[1:] * step[:-1]).sum(axis=1) / (length[1:] * length[:-1])
+    return np.flatnonzero(cosine < SPIKE_COSINE) + 1
+
+
+def _first_loop(points: Float) -> tuple[int, int] | None:
+    """Return the segments ``i < j`` that cross with the fewest segments between them."""
+    segments = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
+    first, second = shapely.STRtree(segments).query(segments, predicate="intersects")
+    between = second - first
+    crossing = between > 1
+    crossing &= ~((first == 0) & (second == len(segments) - 1) & (points[0] == points[-1]).all())
+    if not crossing.any():
+        return None
+    best = np.flatnonzero(crossing)[np.argmin(between[crossing])]
+    return int(first[best]), int(second[best])
