@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -134,7 +134,7 @@ class SingleFrameBatches:
         )
 
 
-def prefetch(make: Callable[[int], Item], first: int, depth: int = 2) -> Iterator[Item]:
+def prefetch(make: Callable[[int], Item], first: int, depth: int = 2) -> Generator[Item]:
     """Yield ``make(first)``, ``make(first + 1)``, ... with a thread working ahead.
 
     Close the iterator to stop the thread. An exception in the thread is raised here.

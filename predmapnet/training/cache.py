@@ -1,4 +1,4 @@
-"""Fill the training cache: render demo towns straight at the network's size, or read and crop the images of a data set."""
+"""Fill the training cache: demo towns rendered straight at the network's size, or a data set's images, cropped."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
     from predmapnet.datasets.ground_truth import truth_from_vector_map
     from predmapnet.demo_world.catalogue import build_world
     from predmapnet.demo_world.renderer import Renderer
-    from predmapnet.demo_world.rig import DEMO_RIG
+    from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 
     world = build_world(folder.name)
     cameras = [window_camera(camera, config, OVERSAMPLING) for camera in DEMO_RIG]
@@ -102,7 +102,15 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
             picture = renderer.render(camera, frame).image
             images[frame, index] = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     truth = truth_from_vector_map(world.map)
-    write_scene(folder, DEMO_RIG, images, poses, [truth.frame(pose, config.roi) for pose in poses])
+    lidar_to_global = poses @ LIDAR_TO_EGO
+    truths = [truth.frame(pose, config.roi) for pose in lidar_to_global]
+    # As the nuScenes reader has it: ego axes, origin at the lidar's x and y.
+    shifted = poses.copy()
+    shifted[:, :2, 3] = lidar_to_global[:, :2, 3]
+    ego_to_shifted = np.eye(4)
+    ego_to_shifted[:2, 3] = -LIDAR_TO_EGO[:2, 3]
+    rig = tuple(replace(camera, camera_to_ego=ego_to_shifted @ camera.camera_to_ego) for camera in DEMO_RIG)
+    write_scene(folder, rig, images, shifted, truths)
 
 
 def window_camera(camera: Camera, config: PredMapNetConfig, factor: int) -> Camera:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import orjson
 import torch
@@ -18,17 +18,18 @@ from torch import Tensor
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import checkpoint
-from predmapnet.training.batches import Batch, prefetch
+from predmapnet.training.batches import prefetch
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, learning_rate, make_optimiser
 from predmapnet.training.settings import Budget, TrainingSettings
 from predmapnet.training.workers import Workers
 
+Data = TypeVar("Data")
 Report = Callable[[str], None]
 Validate = Callable[[PredMapNet, str], dict[str, float]]
 """Called with the averaged network and the stage's name; returns metrics by name."""
 
 
-class Stage(Protocol):
+class Stage(Protocol[Data]):
     """What the loop needs of a stage.
 
     Attributes:
@@ -39,11 +40,15 @@ class Stage(Protocol):
     name: str
     frames_per_step: int
 
-    def make_batch(self, step: int) -> Batch:
+    def begin(self) -> None:
+        """Get ready; the network has the weights that the stage starts from."""
+        ...
+
+    def make_batch(self, step: int) -> Data:
         """Return the data of one step; called in a thread that works ahead, step after step."""
         ...
 
-    def losses(self, step: int, batch: Batch) -> dict[str, Tensor]:
+    def losses(self, step: int, batch: Data) -> dict[str, Tensor]:
         """Return the weighted losses, whose sum is minimised."""
         ...
 
@@ -114,7 +119,9 @@ class Trainer:
         checkpoint.load_weights(self.network, checkpoint.below_prefix("network", tensors), self._stored)
         checkpoint.load_weights(self.average.network, checkpoint.below_prefix("average", tensors), self._stored)
 
-    def run(self, stage: Stage, budget: Budget, optimiser_settings: OptimiserSettings, validate: Validate) -> bool:
+    def run(
+        self, stage: Stage[Data], budget: Budget, optimiser_settings: OptimiserSettings, validate: Validate
+    ) -> bool:
         """Train one stage to the end of its budget.
 
         Args:
@@ -128,8 +135,7 @@ class Trainer:
         """
         if stage.name in self.position.finished:
             return True
-        optimiser = make_optimiser(self.network, optimiser_settings)
-        self._enter(stage, optimiser, optimiser_settings)
+        optimiser = self._enter(stage, optimiser_settings)
         self.network.train()
         position, workers = self.position, self._workers
         start, cpu_start = time.monotonic() - position.seconds, time.process_time()
@@ -187,27 +193,31 @@ class Trainer:
                     return not interrupted
         raise AssertionError("the stream of steps never ends by itself")
 
-    def _enter(self, stage: Stage, optimiser: torch.optim.Optimizer, settings: OptimiserSettings) -> None:
+    def _enter(self, stage: Stage[Data], settings: OptimiserSettings) -> torch.optim.Optimizer:
         """Restore a stage in its middle, or begin it from the averaged weights of the one before."""
         position = self.position
         if position.stage == stage.name and self._stored is not None:
+            stage.begin()
+            optimiser = make_optimiser(self.network, settings)
             tensors = checkpoint.read(self._stored, "network")
             checkpoint.restore_optimiser(optimiser, checkpoint.below_prefix("optimiser", tensors))
             torch.set_rng_state(tensors["random"])
             stage.restore(checkpoint.read(self._stored, f"stage-{self._workers.rank}"))
             self._report(f"Stage {stage.name}: goes on at step {position.step}, frame {position.frames}.")
-            return
+            return optimiser
         self._share_average()
         self.average = WeightAverage(self.network, settings.average_decay)
         position.total_seconds += position.seconds
         position.stage, position.step, position.seconds = stage.name, 0, 0.0
+        stage.begin()
+        return make_optimiser(self.network, settings)
 
     def _share_average(self) -> None:
         """Give every process the averaged weights of process 0."""
         self.network.load_state_dict(self.average.network.state_dict())
         self._workers.spread(self.network)
 
-    def _save(self, stage: Stage, optimiser: torch.optim.Optimizer) -> None:
+    def _save(self, stage: Stage[Data], optimiser: torch.optim.Optimizer) -> None:
         """Write a checkpoint, all processes together."""
         order = len(self.position.finished) * 10_000_000 + self.position.step
         if self._workers.leads:
@@ -261,7 +271,7 @@ class Trainer:
                 signal.signal(number, handler)
 
 
-def _steps(stage: Stage, first: int) -> Iterator[tuple[int, Batch]]:
+def _steps(stage: Stage[Data], first: int) -> Generator[tuple[int, Data]]:
     """Yield steps and their batches, prepared ahead."""
     with closing(prefetch(stage.make_batch, first)) as batches:
         step = first

@@ -77,9 +77,9 @@ class TrainingSettings:
     validation_minutes: float = 8.0
     checkpoint_minutes: float = 3.0
     log_steps: int = 20
-    weights: LossWeights = LossWeights()
-    costs: MatchingCosts = MatchingCosts()
-    optimiser: OptimiserSettings = OptimiserSettings()
-    temporal_optimiser: OptimiserSettings = OptimiserSettings(learning_rate=4e-4)
-    augmentation: AugmentationSettings = AugmentationSettings()
-    streams: StreamSettings = StreamSettings()
+    weights: LossWeights = field(default_factory=LossWeights)
+    costs: MatchingCosts = field(default_factory=MatchingCosts)
+    optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
+    temporal_optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(learning_rate=5e-4))
+    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+    streams: StreamSettings = field(default_factory=StreamSettings)

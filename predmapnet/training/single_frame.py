@@ -58,6 +58,10 @@ class SingleFrameStage:
             (settings.seed, workers.rank),
         )
 
+    def begin(self) -> None:
+        """Train everything."""
+        self._network.requires_grad_(True)
+
     def losses(self, step: int, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of one batch."""
         outputs = self._network(frame_inputs(batch, self._network.config), self._lookup, None)

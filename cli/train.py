@@ -1,0 +1,69 @@
+"""``predmapnet train``: train the network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def train(
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics.jsonl and the weights.")],
+    preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file.")] = "lite",
+    data: Annotated[str, typer.Option(help="Data to train on: demo.")] = "demo",
+    stage: Annotated[str, typer.Option(help="single (frames), temporal (streams), or all.")] = "all",
+    minutes: Annotated[float, typer.Option(min=0.1, help="Time budget; of 'all', two thirds go to single.")] = 60.0,
+    steps: Annotated[int, typer.Option(min=0, help="Limit of optimiser steps per stage; 0 for none.")] = 0,
+    towns: Annotated[int, typer.Option(min=1, help="Number of training scenes.")] = 160,
+    batch: Annotated[int, typer.Option(min=1, help="Frames per step, over all processes.")] = 6,
+    processes: Annotated[int, typer.Option(min=1, help="Processes that share every step.")] = 2,
+    threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of weights and draws.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
+    init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
+    cache: Annotated[Path | None, typer.Option(help="Folder of the training cache.", show_default=False)] = None,
+) -> None:
+    """Train the network; survives being killed, and goes on with --resume.
+
+    One process per core with one thread each is fastest on a CPU that others use too.
+    """
+    import os
+
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+
+    from predmapnet.demo_world.catalogue import default_cache
+    from predmapnet.errors import UserError
+    from predmapnet.training import run
+    from predmapnet.training.settings import Budget, TrainingSettings
+
+    run.check_data(data)
+    if stage not in ("single", "temporal", "all"):
+        raise UserError(f"There is no stage '{stage}'. Choose: single, temporal, all.")
+    share = 2 / 3 if stage == "all" else 1.0
+    limit = steps or None
+    single = Budget(minutes * share, limit) if stage != "temporal" else None
+    temporal = Budget(minutes * (1 - share) if stage == "all" else minutes, limit) if stage != "single" else None
+    options = run.RunOptions(
+        config=run.configuration(preset),
+        data=data,
+        folder=out,
+        cache=cache or default_cache() / "training",
+        towns=towns,
+        validation_towns=10,
+        processes=processes,
+        threads=threads,
+        settings=TrainingSettings(batch=batch, seed=seed, single=single, temporal=temporal),
+        resume=resume,
+        initial=init,
+    )
+    typer.echo(
+        f"Training '{preset}' on {towns} scenes of '{data}' for {minutes:g} minutes (stage {stage}) "
+        f"with {processes} x {threads} threads. Everything goes to {out}."
+    )
+    weights = run.train(options, typer.echo)
+    if weights is None:
+        typer.echo(f"Stopped. Go on with: predmapnet train --out {out} --resume (and the same options)")
+        raise typer.Exit(130)
+    typer.echo(f"The weights are in {weights}.")
+    typer.echo(f"Try them: predmapnet infer scene-0103 --weights {weights} --out map.geojson")

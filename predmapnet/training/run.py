@@ -1,0 +1,182 @@
+"""A training run from its options to its weights: data, processes, stages, export."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from predmapnet.config import PredMapNetConfig, load_config
+from predmapnet.errors import UserError
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training import checkpoint
+from predmapnet.training.batches import TrainingScenes
+from predmapnet.training.cache import DEMO, cache_folder, fill_demo_cache
+from predmapnet.training.frames import read_scene
+from predmapnet.training.loop import Trainer
+from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.single_frame import SingleFrameStage
+from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.validation import validate
+from predmapnet.training.workers import Workers
+
+Report = Callable[[str], None]
+
+WEIGHTS = "weights.safetensors"
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a user chooses.
+
+    Attributes:
+        config: of the network.
+        data: ``demo``.
+        folder: where checkpoints, metrics and weights go.
+        cache: folder of the training caches.
+        towns: number of training scenes.
+        validation_towns: number of validation scenes.
+        processes: training processes that share every step.
+        threads: of each process.
+        settings: how it trains.
+        resume: go on from the newest checkpoint in ``folder``.
+        initial: weights to start from, or None.
+    """
+
+    config: PredMapNetConfig
+    data: str
+    folder: Path
+    cache: Path
+    towns: int
+    validation_towns: int
+    processes: int
+    threads: int
+    settings: TrainingSettings
+    resume: bool = False
+    initial: Path | None = None
+
+
+def train(options: RunOptions, report: Report = print) -> Path | None:
+    """Prepare the data, train, and write the averaged weights.
+
+    Returns:
+        The weights file, or None if the run was interrupted (it can be resumed).
+
+    Raises:
+        UserError: data, checkpoint or weights do not fit.
+    """
+    _check_folder(options)
+    fill_demo_cache(_cache(options), _names(options, "train"), options.config, options.processes, report)
+    fill_demo_cache(_cache(options), _names(options, "val"), options.config, options.processes, report)
+    meeting_point = options.folder / f".meeting-{os.getpid()}"
+    options.folder.mkdir(parents=True, exist_ok=True)
+    meeting_point.unlink(missing_ok=True)
+    context = multiprocessing.get_context("spawn")
+    others = [
+        context.Process(target=_other_process, args=(options, rank, meeting_point), daemon=True)
+        for rank in range(1, options.processes)
+    ]
+    for process in others:
+        process.start()
+    try:
+        finished = _train_process(options, Workers(0, options.processes), meeting_point, report)
+        for process in others:
+            process.join()
+    finally:
+        meeting_point.unlink(missing_ok=True)
+    return export(options.folder, options.config) if finished else None
+
+
+def export(folder: Path, config: PredMapNetConfig) -> Path:
+    """Write the averaged weights of the newest checkpoint in ``folder`` as a file of their own.
+
+    Raises:
+        UserError: there is no checkpoint.
+    """
+    newest = checkpoint.latest(folder)
+    if newest is None:
+        raise UserError(f"There is no checkpoint in {folder}.")
+    network = PredMapNet(config)
+    average = checkpoint.below_prefix("average", checkpoint.read(newest, "network"))
+    checkpoint.load_weights(network, average, newest)
+    return checkpoint.write_weights(folder / WEIGHTS, network, checkpoint.read_json(newest / "position.json"))
+
+
+def _other_process(options: RunOptions, rank: int, meeting_point: Path) -> None:
+    """Body of every process but the first; it says nothing."""
+    _train_process(options, Workers(rank, options.processes), meeting_point, lambda _line: None)
+
+
+def _train_process(options: RunOptions, workers: Workers, meeting_point: Path, report: Report) -> bool:
+    """Run all stages in one process; return whether they were finished."""
+    torch.set_num_threads(options.threads)
+    workers.join(meeting_point)
+    try:
+        return _run_stages(options, workers, report)
+    finally:
+        workers.leave()
+
+
+def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
+    settings = options.settings
+    torch.manual_seed(settings.seed)
+    network = PredMapNet(options.config)
+    if options.initial is not None and not options.resume:
+        checkpoint.load_weights(network, checkpoint.read_weights(options.initial), options.initial)
+    trainer = Trainer(network, settings, options.folder, workers, report)
+    if options.resume:
+        trainer.resume()
+    scenes = TrainingScenes([read_scene(_cache(options) / name) for name in _names(options, "train")])
+    validation = [read_scene(_cache(options) / name) for name in _names(options, "val")] if workers.leads else []
+    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
+
+    def measure(average: PredMapNet, stage: str) -> dict[str, float]:
+        return validate(average, lookup, validation, streaming=stage == TemporalStage.name)
+
+    if settings.single is not None:
+        single = SingleFrameStage(network, lookup, scenes, settings, workers)
+        if not trainer.run(single, settings.single, settings.optimiser, measure):
+            return False
+    if settings.temporal is not None:
+        temporal = TemporalStage(network, lookup, scenes, settings, options.folder, workers, report)
+        return trainer.run(temporal, settings.temporal, settings.temporal_optimiser, measure)
+    return True
+
+
+def _check_folder(options: RunOptions) -> None:
+    """Refuse to mix runs, and to train tracks on a network that sees nothing."""
+    started = checkpoint.latest(options.folder) is not None
+    if started and not options.resume:
+        raise UserError(f"{options.folder} holds a run already. Go on with --resume, or choose another --out.")
+    if options.settings.single is None and not (options.resume or options.initial):
+        raise UserError("The temporal stage needs a network that sees: give --resume or --init weights.safetensors.")
+
+
+def _cache(options: RunOptions) -> Path:
+    return cache_folder(options.cache, options.data, options.config)
+
+
+def _names(options: RunOptions, split: str) -> list[str]:
+    """Names of the scenes of one split that this run uses."""
+    from predmapnet.demo_world.catalogue import scene_infos
+
+    names = [info.name for info in scene_infos(split)]
+    wanted = options.towns if split == "train" else options.validation_towns
+    if wanted > len(names):
+        raise UserError(f"The demo world has {len(names)} {split} scenes, not {wanted}.")
+    return names[:wanted]
+
+
+def check_data(data: str) -> None:
+    """Raise UserError for a data set that cannot be trained on yet."""
+    if data != DEMO:
+        raise UserError(f"There is no training data '{data}'. Choose: {DEMO}.")
+
+
+def configuration(preset: str) -> PredMapNetConfig:
+    """Return a preset, or the configuration in a JSON file. Raises UserError."""
+    return load_config(preset)

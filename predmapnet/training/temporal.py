@@ -1,0 +1,212 @@
+"""The temporal stage: tracks, memories and forecasts learn in long streams over cached BEV features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from predmapnet.network.image_input import normalise_images
+from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, StreamState
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.tracking import instances_from_rows
+from predmapnet.network.view_transform import RigLookup
+from predmapnet.training.batches import TrainingScenes
+from predmapnet.training.losses import forecast_loss, frame_losses
+from predmapnet.training.ownership import Chosen, Owners, choose_tracks, owned_truth
+from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.single_frame import roi_size
+from predmapnet.training.streams import Clip, FeatureStore, StreamClips, StreamPlan
+from predmapnet.training.targets import Targets
+from predmapnet.training.workers import Workers
+
+ENCODE_BATCH = 4
+FROZEN = ("image_backbone", "bev_encoder", "depth_head")
+
+
+class TemporalStage:
+    """Losses of streams that carry their state from step to step; gradients reach over a clip's frames.
+
+    Attributes:
+        name: of the stage.
+        frames_per_step: frames that this process sees in one step.
+    """
+
+    name = "temporal"
+
+    def __init__(
+        self,
+        network: PredMapNet,
+        lookup: RigLookup,
+        scenes: TrainingScenes,
+        settings: TrainingSettings,
+        folder: Path,
+        workers: Workers,
+        report: Callable[[str], None] = print,
+    ) -> None:
+        self.frames_per_step = settings.streams.streams * settings.streams.frames
+        self._network = network
+        self._lookup = lookup
+        self._scenes = scenes
+        self._settings = settings
+        self._folder = folder
+        self._workers = workers
+        self._report = report
+        self._size = roi_size(network.config)
+        self._plan = StreamPlan.start(settings.streams.streams)
+        self._state = network.initial_state(settings.streams.streams)
+        self._owners = Owners.none(settings.streams.streams)
+        self._clips: StreamClips | None = None
+
+    def begin(self) -> None:
+        """Freeze what makes BEV features and compute those of all frames once."""
+        for part in FROZEN:
+            module = getattr(self._network, part)
+            if module is not None:
+                module.requires_grad_(False)
+        config = self._network.config
+        sizes = ((config.bev.rows, config.bev.columns),)
+        sizes += tuple((-(-sizes[0][0] // scale), -(-sizes[0][1] // scale)) for scale in (2, 4))
+        shapes = tuple((width, *size) for width, size in zip(config.bev.widths, sizes, strict=True))
+        store = FeatureStore(self._folder / self._fingerprint(), shapes)
+        self._fill(store)
+        self._workers.wait()
+        seed = (self._settings.seed, self._workers.rank, 1)
+        self._clips = StreamClips(self._scenes, store, self._settings.streams, config.roi, config.decoder.points, seed)
+        self._clips.plan = self._plan
+
+    def make_batch(self, step: int) -> Clip:
+        """Return the next frames of all streams."""
+        assert self._clips is not None, "begin() comes first"
+        return self._clips(step)
+
+    def losses(self, step: int, batch: Clip) -> dict[str, Tensor]:
+        """Return the weighted losses of the next frames, mean over frames, and carry the state on."""
+        settings = self._settings.streams
+        generator = np.random.default_rng([self._settings.seed, self._workers.rank, 2, step])
+        forgetful = torch.from_numpy(generator.random(settings.streams) < settings.state_dropout)
+        state = forget(self._state, batch.fresh | forgetful)
+        owners = self._owners
+        terms: dict[str, Tensor] = {}
+        following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
+        for instant, features, coming in zip(batch.instants, batch.features, following, strict=True):
+            inputs = FrameInputs(features.fine.new_zeros(0), instant.camera_valid, instant.ego_to_global)
+            outputs = self._network.decode_bev(features, inputs, state)
+            rows = state.instances.valid.shape[1]
+            points = outputs.layers[-1].points
+            assert points is not None
+            tracks = owned_truth(owners, outputs.row_valid[:, :rows], points[:, :rows], instant.targets, self._size)
+            weights, costs = self._settings.weights, self._settings.costs
+            found = frame_losses(outputs, instant.targets, self._size, weights, costs, tracks, rows)
+            chosen = choose_tracks(outputs, rows, owners, found.assignment, instant.targets, settings, generator)
+            instances = named_instances(outputs, chosen, state)
+            state = self._network.advance(state, outputs, instances, inputs)
+            owners = chosen.owners
+            found.terms["forecast"] = self._forecast(state, chosen, coming)
+            for name, term in found.terms.items():
+                share = term / len(batch.instants)
+                terms[name] = terms[name] + share if name in terms else share
+        self._state, self._owners, self._plan = detached(state), owners, batch.plan
+        return terms
+
+    def _forecast(self, state: StreamState, chosen: Chosen, coming: Targets) -> Tensor:
+        """Prediction loss of the tracks whose element is still there in the next frame."""
+        if self._network.future_guidance is None:
+            return state.forecasts.new_zeros(())
+        pairs = owned_truth(chosen.owners, chosen.valid, state.forecasts, coming, self._size)
+        loss = forecast_loss(state.forecasts[pairs.frame, pairs.row], coming.points[pairs.truth], self._size)
+        return self._settings.weights.forecast * loss / max(len(pairs), 1)
+
+    def state(self) -> dict[str, Tensor]:
+        """Return plan, state and owners of the streams."""
+        tensors = {f"plan.{name}": value for name, value in self._plan.tensors().items()}
+        tensors |= {f"owners.{name}": value for name, value in vars(self._owners).items()}
+        for name, value in vars(self._state).items():
+            if isinstance(value, Tensor):
+                tensors[f"state.{name}"] = value
+        return tensors | {f"instances.{name}": value for name, value in vars(self._state.instances).items()}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Continue from what :meth:`state` returned."""
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+
+        self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
+        self._owners = Owners(**part("owners."))
+        self._state = StreamState(instances=Instances(**part("instances.")), **part("state."))
+        if self._clips is not None:
+            self._clips.plan = self._plan
+
+    def _fingerprint(self) -> str:
+        """Name of the frozen weights, so that features of others are never mixed in."""
+        digest = sha256()
+        for part in FROZEN:
+            module = getattr(self._network, part)
+            for value in [] if module is None else module.state_dict().values():
+                digest.update(value.contiguous().numpy().tobytes())
+        return f"features-{digest.hexdigest()[:12]}"
+
+    @torch.no_grad()
+    def _fill(self, store: FeatureStore) -> None:
+        """Encode the scenes that are not stored yet, shared out over the processes."""
+        self._network.eval()
+        missing = [index for index in range(len(self._scenes.scenes)) if not store.has(index)]
+        for done, scene in enumerate(mine := missing[self._workers.rank :: self._workers.size]):
+            frames = len(self._scenes.scenes[scene])
+            with store.writing(scene, frames) as values:
+                for start in range(0, frames, ENCODE_BATCH):
+                    stop = min(start + ENCODE_BATCH, frames)
+                    loaded = [self._scenes.load(scene, frame, store.mirrored(scene)) for frame in range(start, stop)]
+                    images = torch.from_numpy(np.stack([frame.images for frame in loaded]))
+                    normalised = normalise_images(images, self._network.config.image)
+                    valid = torch.ones(images.shape[:2], dtype=torch.bool)
+                    inputs = FrameInputs(normalised, valid, torch.zeros(stop - start, 4, 4, dtype=torch.float64))
+                    values[start:stop] = store.pack(self._network.encode_bev(inputs, self._lookup))
+            if self._workers.leads and done % 10 == 9:
+                self._report(f"BEV features: {done + 1}/{len(mine)} scenes of this process")
+
+
+def named_instances(outputs: FrameOutputs, chosen: Chosen, state: StreamState) -> Instances:
+    """Turn chosen rows into instances; tracks keep their ids, newborns get the next free ones."""
+    newborn = chosen.valid & (chosen.identity < 0)
+    fresh_ids = state.next_track_id[:, None] + newborn.long().cumsum(1) - 1
+    batch = len(newborn)
+    # One more column stands for "no former track".
+    former = torch.cat([state.instances.track_ids, state.instances.track_ids.new_full((batch, 1), -1)], 1)
+    kept_ids = former[torch.arange(batch)[:, None], chosen.identity]
+    return instances_from_rows(outputs, chosen.rows, chosen.valid, torch.where(newborn, fresh_ids, kept_ids))
+
+
+def forget(state: StreamState, streams: Tensor) -> StreamState:
+    """Return the state with some streams as if they had just begun.
+
+    Args:
+        state: of ``B`` streams.
+        streams: ``(B,) bool``, which ones forget.
+    """
+    keep = ~streams[:, None]
+    instances = replace(
+        state.instances,
+        valid=state.instances.valid & keep,
+        track_ids=state.instances.track_ids.masked_fill(~keep, -1),
+    )
+    return replace(
+        state,
+        instances=instances,
+        point_history_valid=state.point_history_valid & keep[:, :, None],
+        next_track_id=state.next_track_id.masked_fill(streams, 0),
+        bev_memory_valid=state.bev_memory_valid & keep,
+    )
+
+
+def detached(state: StreamState) -> StreamState:
+    """Return the state without its gradient history."""
+    instances = Instances(**{name: value.detach() for name, value in vars(state.instances).items()})
+    tensors = {name: value.detach() for name, value in vars(state).items() if isinstance(value, Tensor)}
+    return StreamState(instances=instances, **tensors)
