@@ -43,8 +43,8 @@ def fill_materials(
         share_y = wide - wide_row
         for column in range(columns):
             x = origin_x + (column + 0.5) * texel
-            entry = table[material[row, column]]
-            grain = (white[fine_row, int(np.floor(x / 0.05)) & 1023] - 0.5) * 2 * entry[3] * grain_scale
+            kind = material[row, column]
+            grain = (white[fine_row, int(np.floor(x / 0.05)) & 1023] - 0.5) * 2 * table[kind, 3] * grain_scale
             blotch = (fractal[blotch_row, int(np.floor(x / 0.035)) & 1023] - 0.5) * 2
             wide = x / 0.6
             wide_column = int(np.floor(wide))
@@ -54,9 +54,9 @@ def fill_materials(
             low = fractal[(wide_row + 1) & 1023, wide_column & 1023] * (1 - share_x)
             low += fractal[(wide_row + 1) & 1023, (wide_column + 1) & 1023] * share_x
             drift = (top * (1 - share_y) + low * share_y - 0.5) * 2
-            factor = 1 + grain + entry[4] * blotch + entry[5] * drift
-            red, green, blue = entry[0], entry[1], entry[2]
-            pattern = entry[6]
+            factor = 1 + grain + table[kind, 4] * blotch + table[kind, 5] * drift
+            red, green, blue = table[kind, 0], table[kind, 1], table[kind, 2]
+            pattern = table[kind, 6]
             if pattern == 1.0:
                 joint_x, joint_y = x / 1.5, y / 1.5
                 joint_x -= np.floor(joint_x)
@@ -80,11 +80,12 @@ def fill_materials(
 
 
 @kernel
-def _edge(x: float, y: float, corners: Float, first: int, second: int) -> float:
+def _edge(x: float, y: float, quads: Float, index: int, first: int, second: int) -> float:
     """Signed distance to the left of the edge between two corners, texels."""
-    edge_x, edge_y = corners[second, 0] - corners[first, 0], corners[second, 1] - corners[first, 1]
+    start_x, start_y = quads[index, first, 0], quads[index, first, 1]
+    edge_x, edge_y = quads[index, second, 0] - start_x, quads[index, second, 1] - start_y
     length = np.sqrt(edge_x * edge_x + edge_y * edge_y) + 1e-12
-    return ((y - corners[first, 1]) * edge_x - (x - corners[first, 0]) * edge_y) / length
+    return ((y - start_y) * edge_x - (x - start_x) * edge_y) / length
 
 
 @kernel
@@ -100,18 +101,20 @@ def fill_paint(quads: Float, attributes: Float, texel: float, wear_tile: Float32
     """
     rows, columns = paint.shape[0], paint.shape[1]
     for index in range(len(quads)):
-        corners = quads[index]
         wear = attributes[index, 0]
-        low_x, high_x = corners[:, 0].min(), corners[:, 0].max()
-        low_y, high_y = corners[:, 1].min(), corners[:, 1].max()
+        low_x = low_y = 1e30
+        high_x = high_y = -1e30
+        for corner in range(4):
+            low_x, high_x = min(low_x, quads[index, corner, 0]), max(high_x, quads[index, corner, 0])
+            low_y, high_y = min(low_y, quads[index, corner, 1]), max(high_y, quads[index, corner, 1])
         margin = 6
         for row in range(max(0, int(low_y) - margin), min(rows, int(high_y) + margin + 1)):
             for column in range(max(0, int(low_x) - margin), min(columns, int(high_x) + margin + 1)):
                 x, y = column + 0.5, row + 0.5
-                low = min(1.0, max(0.0, 0.5 + _edge(x, y, corners, 0, 1)))
-                high = min(1.0, max(0.0, 0.5 + _edge(x, y, corners, 2, 3)))
-                start = min(1.0, max(0.0, 0.5 + _edge(x, y, corners, 3, 0)))
-                stop = min(1.0, max(0.0, 0.5 + _edge(x, y, corners, 1, 2)))
+                low = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 0, 1)))
+                high = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 2, 3)))
+                start = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 3, 0)))
+                stop = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 1, 2)))
                 coverage = max(0.0, low + high - 1) * max(0.0, start + stop - 1)
                 if coverage > 0 and wear > 0:
                     chip = 0.65 * wear_tile[row & 1023, column & 1023]

@@ -11,12 +11,13 @@ from predmapnet.demo_world.ground_texture import Pyramid
 from predmapnet.demo_world.jit import kernel
 from predmapnet.demo_world.looks import Light
 from predmapnet.demo_world.mesh import Mesh
-from predmapnet.demo_world.raster import View, ball_depth, face_plane
+from predmapnet.demo_world.raster import Vector, View, ball_depth, face_plane, pixel_ray
 from predmapnet.demo_world.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
 
 Byte = NDArray[np.uint8]
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Integer = NDArray[np.int64]
 Integer32 = NDArray[np.int32]
 
 
@@ -86,7 +87,7 @@ def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient
 
 @kernel
 def _ground_colour(
-    around: Surroundings, view: View, px: float, py: float, ray: Float, dynamic: float, most: int
+    around: Surroundings, view: View, px: float, py: float, ray: Vector, dynamic: float, most: int
 ) -> Colour:
     """Radiance of the ground seen at pixel position (px, py) along ``ray`` (camera depth 1)."""
     rotation, light = view.rotation, around.light
@@ -107,7 +108,7 @@ def _ground_colour(
 
 @kernel
 def _sky_mirror(
-    around: Surroundings, ray: Float, length: float, nx: float, ny: float, nz: float
+    around: Surroundings, ray: Vector, length: float, nx: float, ny: float, nz: float
 ) -> tuple[float, float, float, float]:
     """Sky seen in a smooth surface, and Schlick's share of reflection."""
     x, y, z = ray[0] / length, ray[1] / length, ray[2] / length
@@ -120,7 +121,7 @@ def _sky_mirror(
 
 
 @kernel
-def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth: float, ray: Float) -> Colour:
+def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth: float, ray: Vector) -> Colour:
     light = around.light
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
@@ -129,8 +130,7 @@ def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth:
     red, green, blue = mesh.colours[face, 0], mesh.colours[face, 1], mesh.colours[face, 2]
     glass = lit_window = 0.0
     if material == 1:
-        start = mesh.corners[face, 0]
-        along = (start[1] - y) * nx + (x - start[0]) * -ny if abs(nz) < 0.5 else 0.0
+        along = (y - mesh.corners[face, 0, 1]) * nx - (x - mesh.corners[face, 0, 0]) * ny if abs(nz) < 0.5 else 0.0
         blur = depth / view.focal_x / max(0.15, -(ray[0] * nx + ray[1] * ny) / length)
         red, green, blue, glass, lit_window = facade(light, around.fractal, owner, along, z, blur, red, green, blue)
     elif material == 3 or material == 10 or material == 0:
@@ -168,11 +168,15 @@ def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth:
 
 
 @kernel
-def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth: float, ray: Float) -> Colour:
-    light, ball = around.light, mesh.balls[index]
+def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth: float, ray: Vector) -> Colour:
+    light, balls = around.light, mesh.balls
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
-    nx, ny, nz = (x - ball[0]) / ball[3] ** 2, (y - ball[1]) / ball[4] ** 2, (z - ball[2]) / ball[5] ** 2
+    nx, ny, nz = (
+        (x - balls[index, 0]) / balls[index, 3] ** 2,
+        (y - balls[index, 1]) / balls[index, 4] ** 2,
+        (z - balls[index, 2]) / balls[index, 5] ** 2,
+    )
     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / norm, ny / norm, nz / norm
     red, green, blue = mesh.ball_colours[index, 0], mesh.ball_colours[index, 1], mesh.ball_colours[index, 2]
@@ -186,7 +190,7 @@ def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth
         red, green, blue = red * texture, green * texture, blue * texture
         shine = 0.35 * shine + 0.35
         shine *= 0.5 + clump
-        ambient *= 0.55 + 0.45 * min(1.0, max(0.0, (z - ball[2]) / ball[5] + 1.0))
+        ambient *= 0.55 + 0.45 * min(1.0, max(0.0, (z - balls[index, 2]) / balls[index, 5] + 1.0))
     lit = _lit(around, x, y, z, max(0.0, shine), ambient, 0.7)
     return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), depth * length)
 
@@ -194,7 +198,7 @@ def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth
 @kernel
 def shade_image(
     around: Surroundings, mesh: Mesh, view: View, samples: int, most: int, ids: Integer32, nearness: Float32,
-    dynamic: Byte, image: Float32, depth: Float32, ground_share: Float32,
+    dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
 ) -> None:  # fmt: skip
     """Shade all pixels; each face in a pixel is shaded once, weighted by the samples that it covers.
 
@@ -204,15 +208,13 @@ def shade_image(
         most: largest number of ground samples along a footprint.
         ids, nearness: z-buffer, ``(samples * height, samples * width)``.
         dynamic: ``(height, width)``, 255 where no moving thing darkens the ground.
+        found, scratch: ``(16,)`` and ``(4, 16)``, overwritten.
         image: ``(height, width, 3)`` receives linear radiance.
         depth: ``(height, width)`` receives metres along the optical axis, infinite for the sky.
         ground_share: ``(height, width)`` receives how much of a pixel is ground.
     """
     faces = len(mesh.counts)
-    found, weight = np.empty(16, dtype=np.int64), np.empty(16)
-    sum_x, sum_y, close = np.empty(16), np.empty(16), np.empty(16)
-    ray, plane = np.empty(3), np.empty(3)
-    rotation = view.rotation
+    weight, sum_x, sum_y, close = scratch[0], scratch[1], scratch[2], scratch[3]
     each = 1.0 / (samples * samples)
     for row in range(view.height):
         for column in range(view.width):
@@ -240,9 +242,7 @@ def shade_image(
                 if number < 0:
                     # Only solids need the centre of what they cover: ground and sky are evaluated at the pixel's.
                     x, y = column + 0.5, row + 0.5
-                across, down = (x - view.centre_x) / view.focal_x, (y - view.centre_y) / view.focal_y
-                for axis in range(3):
-                    ray[axis] = rotation[axis, 0] * across + rotation[axis, 1] * down + rotation[axis, 2]
+                ray = pixel_ray(view, x, y)
                 here = np.inf
                 if number < 0:
                     if ray[2] < -1e-5:
@@ -253,17 +253,17 @@ def shade_image(
                         length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
                         colour = sky(around.light, around.clouds, ray[0] / length, ray[1] / length, ray[2] / length)
                 elif number < faces:
-                    face_plane(mesh.corners[number, 0], mesh.normals[number], view, plane)
+                    plane = face_plane(mesh.corners, mesh.normals, number, view)
                     shaded = 1 / max(plane[0] * x + plane[1] * y + plane[2], 1e-6)
                     colour = _face_colour(around, mesh, view, number, shaded, ray)
                     here = plane[0] * (column + 0.5) + plane[1] * (row + 0.5) + plane[2]
                     here = 1 / here if here > 0.5 * close[slot] and here < 2 * close[slot] else 1 / close[slot]
                 else:
-                    shaded = ball_depth(mesh.balls[number - faces], view, x, y)
+                    shaded = ball_depth(mesh.balls, number - faces, view, x, y)
                     if shaded <= 0:
                         shaded = 1 / close[slot]
                     colour = _ball_colour(around, mesh, view, number - faces, shaded, ray)
-                    here = ball_depth(mesh.balls[number - faces], view, column + 0.5, row + 0.5)
+                    here = ball_depth(mesh.balls, number - faces, view, column + 0.5, row + 0.5)
                     if here <= 0:
                         here = 1 / close[slot]
                 red, green, blue = red + part * colour[0], green + part * colour[1], blue + part * colour[2]
@@ -278,14 +278,11 @@ def shade_image(
 def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image: Float32) -> None:
     """Add to wet ground what it mirrors, smeared vertically as rough water does; see :func:`shade_image`."""
     light, rotation = around.light, view.rotation
-    ray = np.empty(3)
     for row in range(view.height):
         for column in range(view.width):
             if ground_share[row, column] < 0.01:
                 continue
-            across, down = (column + 0.5 - view.centre_x) / view.focal_x, (row + 0.5 - view.centre_y) / view.focal_y
-            for axis in range(3):
-                ray[axis] = rotation[axis, 0] * across + rotation[axis, 1] * down + rotation[axis, 2]
+            ray = pixel_ray(view, column + 0.5, row + 0.5)
             if ray[2] > -1e-5:
                 continue
             length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])

@@ -20,7 +20,15 @@ if not os.access(Path(__file__).parent, os.W_OK) and not numba.config.CACHE_DIR:
 def kernel(function: Function) -> Function:
     """Compile ``function`` with numba; it releases the GIL, so threads render cameras side by side.
 
-    Infinities keep their meaning (depth of the sky), so only the harmless part of "fast math" is on.
+    Infinities keep their meaning (depth of the sky), so only the harmless part of "fast math" is on. Kernels may not
+    allocate: without numba's reference counting, which would count every array of every argument of every call inside
+    the loops over pixels, they run several times as fast. Scratch space comes from the caller.
     """
-    options = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"reassoc", "contract", "arcp", "nsz"}}
+    options = {
+        "cache": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "_nrt": False,
+        "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+    }
     return cast(Function, numba.njit(**options)(function))

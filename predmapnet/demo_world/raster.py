@@ -15,7 +15,9 @@ from predmapnet.demo_world.jit import kernel
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Integer = NDArray[np.int64]
 Integer32 = NDArray[np.int32]
+Vector = tuple[float, float, float]
 
 NEAR = 0.12
 """Metres before the camera where faces are cut."""
@@ -42,28 +44,36 @@ class View(NamedTuple):
 
 
 @kernel
-def face_plane(corner: Float, normal: Float, view: View, plane: Float) -> None:
-    """Write into ``plane`` (3,) the coefficients of ``1 / depth = p0 * x + p1 * y + p2``, pixels."""
-    rotation, position = view.rotation, view.position
-    distance = 0.0
-    for axis in range(3):
-        distance += normal[axis] * (corner[axis] - position[axis])
-    if abs(distance) < 1e-9:
-        distance = -1e-9
-    along = np.empty(3)
-    for axis in range(3):
-        along[axis] = (
-            normal[0] * rotation[0, axis] + normal[1] * rotation[1, axis] + normal[2] * rotation[2, axis]
-        ) / distance
-    plane[0] = along[0] / view.focal_x
-    plane[1] = along[1] / view.focal_y
-    plane[2] = along[2] - plane[0] * view.centre_x - plane[1] * view.centre_y
+def pixel_ray(view: View, x: float, y: float) -> Vector:
+    """Direction through pixel position (x, y), global frame, its component along the optical axis being 1."""
+    across, down = (x - view.centre_x) / view.focal_x, (y - view.centre_y) / view.focal_y
+    rotation = view.rotation
+    return (
+        rotation[0, 0] * across + rotation[0, 1] * down + rotation[0, 2],
+        rotation[1, 0] * across + rotation[1, 1] * down + rotation[1, 2],
+        rotation[2, 0] * across + rotation[2, 1] * down + rotation[2, 2],
+    )
 
 
 @kernel
-def _project_clipped(corners: Float, count: int, view: View, screen: Float) -> int:
-    """Cut a face at the near plane and project it; returns the number of corners written to ``screen`` (10, 2)."""
-    local = np.empty((8, 3))
+def face_plane(corners: Float, normals: Float, face: int, view: View) -> Vector:
+    """Coefficients of ``1 / depth = p0 * x + p1 * y + p2`` over a face, pixels."""
+    rotation, position = view.rotation, view.position
+    nx, ny, nz = normals[face, 0], normals[face, 1], normals[face, 2]
+    distance = nx * (corners[face, 0, 0] - position[0])
+    distance += ny * (corners[face, 0, 1] - position[1]) + nz * (corners[face, 0, 2] - position[2])
+    if abs(distance) < 1e-9:
+        distance = -1e-9
+    along = (nx * rotation[0, 0] + ny * rotation[1, 0] + nz * rotation[2, 0]) / distance / view.focal_x
+    down = (nx * rotation[0, 1] + ny * rotation[1, 1] + nz * rotation[2, 1]) / distance / view.focal_y
+    constant = (nx * rotation[0, 2] + ny * rotation[1, 2] + nz * rotation[2, 2]) / distance
+    return along, down, constant - along * view.centre_x - down * view.centre_y
+
+
+@kernel
+def _project_clipped(corners: Float, count: int, view: View, scratch: Float) -> int:
+    """Cut a face at the near plane and project it into rows 8 to 17 of ``scratch`` (18, 3); returns how many."""
+    local, screen = scratch[:8], scratch[8:]
     nearest, farthest = 1e30, -1e30
     for index in range(count):
         for axis in range(3):
@@ -95,26 +105,47 @@ def _project_clipped(corners: Float, count: int, view: View, screen: Float) -> i
 
 
 @kernel
+def _span(screen: Float, count: int, y: float, columns: int) -> tuple[int, int]:
+    """First column whose centre lies inside a convex outline at height ``y``, and the one past the last."""
+    low, high = 1e30, -1e30
+    for index in range(count):
+        following = index + 1 if index + 1 < count else 0
+        y0, y1 = screen[index, 1], screen[following, 1]
+        if (y0 <= y) != (y1 <= y):
+            x = screen[index, 0] + (y - y0) / (y1 - y0) * (screen[following, 0] - screen[index, 0])
+            low, high = min(low, x), max(high, x)
+    if high < low:
+        return 0, 0
+    first = max(0, int(np.ceil(max(low, -1.0) - 0.5)))
+    return first, min(columns, int(np.ceil(min(high, columns + 1.0) - 0.5)))
+
+
+@kernel
+def _rows_of(screen: Float, count: int, rows: int) -> tuple[int, int]:
+    """First row whose centre lies inside an outline, and the one past the last."""
+    top, bottom = 1e30, -1e30
+    for index in range(count):
+        top, bottom = min(top, screen[index, 1]), max(bottom, screen[index, 1])
+    first = max(0, int(np.ceil(max(top, -1.0) - 0.5)))
+    return first, min(rows, int(np.ceil(min(bottom, rows + 1.0) - 0.5)))
+
+
+@kernel
 def draw_faces(
-    corners: Float,
-    counts: NDArray[np.int64],
-    normals: Float,
-    view: View,
-    samples: int,
-    nearness: Float32,
+    corners: Float, counts: Integer, normals: Float, view: View, samples: int, scratch: Float, nearness: Float32,
     ids: Integer32,
-) -> None:
+) -> None:  # fmt: skip
     """Draw all faces.
 
     Args:
         corners, counts, normals: as in :class:`predmapnet.demo_world.mesh.Mesh`.
         view: the camera.
         samples: per pixel and direction.
+        scratch: ``(18, 3)``, overwritten.
         nearness: ``(samples * height, samples * width)``: largest ``1 / depth`` so far, changed in place.
         ids: same shape: face that is nearest, -1 for none, changed in place.
     """
-    screen = np.empty((10, 2))
-    plane = np.empty(3)
+    screen = scratch[8:]
     rows, columns = nearness.shape
     for face in range(len(counts)):
         facing = 0.0
@@ -122,32 +153,17 @@ def draw_faces(
             facing += normals[face, axis] * (corners[face, 0, axis] - view.position[axis])
         if facing >= 0:
             continue
-        count = _project_clipped(corners[face], counts[face], view, screen)
+        count = _project_clipped(corners[face], counts[face], view, scratch)
         if count < 3:
             continue
-        top, bottom, left, right = 1e30, -1e30, 1e30, -1e30
         for index in range(count):
             screen[index, 0] *= samples
             screen[index, 1] *= samples
-            left, right = min(left, screen[index, 0]), max(right, screen[index, 0])
-            top, bottom = min(top, screen[index, 1]), max(bottom, screen[index, 1])
-        if right <= 0 or left >= columns or bottom <= 0 or top >= rows:
-            continue
-        face_plane(corners[face, 0], normals[face], view, plane)
-        for row in range(max(0, int(np.ceil(top - 0.5))), min(rows, int(np.ceil(bottom - 0.5)))):
-            y = row + 0.5
-            low, high = 1e30, -1e30
-            for index in range(count):
-                following = index + 1 if index + 1 < count else 0
-                y0, y1 = screen[index, 1], screen[following, 1]
-                if (y0 <= y) != (y1 <= y):
-                    x = screen[index, 0] + (y - y0) / (y1 - y0) * (screen[following, 0] - screen[index, 0])
-                    low, high = min(low, x), max(high, x)
-            if high < low:
-                continue
-            first = max(0, int(np.ceil(max(low, -1.0) - 0.5)))
-            last = min(columns, int(np.ceil(min(high, columns + 1.0) - 0.5)))
-            constant = plane[1] * y / samples + plane[2]
+        plane = face_plane(corners, normals, face, view)
+        top, bottom = _rows_of(screen, count, rows)
+        for row in range(top, bottom):
+            first, last = _span(screen, count, row + 0.5, columns)
+            constant = plane[1] * (row + 0.5) / samples + plane[2]
             slope = plane[0] / samples
             for column in range(first, last):
                 value = np.float32(slope * (column + 0.5) + constant)
@@ -157,21 +173,24 @@ def draw_faces(
 
 
 @kernel
-def ball_depth(ball: Float, view: View, x: float, y: float) -> float:
+def _ball_space(balls: Float, index: int, x: float, y: float, z: float) -> Vector:
+    """A vector of the global frame, in units of an ellipsoid's half axes."""
+    cosine, sine = np.cos(balls[index, 6]), np.sin(balls[index, 6])
+    u, v = (cosine * x + sine * y) / balls[index, 3], (cosine * y - sine * x) / balls[index, 4]
+    return u, v, z / balls[index, 5]
+
+
+@kernel
+def ball_depth(balls: Float, index: int, view: View, x: float, y: float) -> float:
     """Depth along the optical axis where the ray of pixel position (x, y) meets an ellipsoid, or -1."""
-    cosine, sine = np.cos(ball[6]), np.sin(ball[6])
-    across, down = (x - view.centre_x) / view.focal_x, (y - view.centre_y) / view.focal_y
-    ray_x = view.rotation[0, 0] * across + view.rotation[0, 1] * down + view.rotation[0, 2]
-    ray_y = view.rotation[1, 0] * across + view.rotation[1, 1] * down + view.rotation[1, 2]
-    ray_z = (view.rotation[2, 0] * across + view.rotation[2, 1] * down + view.rotation[2, 2]) / ball[5]
-    start_x, start_y = view.position[0] - ball[0], view.position[1] - ball[1]
-    start_z = (view.position[2] - ball[2]) / ball[5]
-    ray_u, ray_v = (cosine * ray_x + sine * ray_y) / ball[3], (cosine * ray_y - sine * ray_x) / ball[4]
-    start_u, start_v = (cosine * start_x + sine * start_y) / ball[3], (cosine * start_y - sine * start_x) / ball[4]
-    square = ray_u * ray_u + ray_v * ray_v + ray_z * ray_z
-    half = ray_u * start_u + ray_v * start_v + ray_z * start_z
-    constant = start_u * start_u + start_v * start_v + start_z * start_z - 1
-    inside = half * half - square * constant
+    ray = pixel_ray(view, x, y)
+    position = view.position
+    du, dv, dw = _ball_space(balls, index, ray[0], ray[1], ray[2])
+    su, sv, sw = _ball_space(
+        balls, index, position[0] - balls[index, 0], position[1] - balls[index, 1], position[2] - balls[index, 2]
+    )
+    square, half = du * du + dv * dv + dw * dw, du * su + dv * sv + dw * sw
+    inside = half * half - square * (su * su + sv * sv + sw * sw - 1)
     if inside < 0:
         return -1.0
     return float((-half - np.sqrt(inside)) / square)
@@ -179,7 +198,7 @@ def ball_depth(ball: Float, view: View, x: float, y: float) -> float:
 
 @kernel
 def draw_balls(
-    balls: Float, leafy: NDArray[np.int64], first_id: int, view: View, samples: int, noise: Float32, nearness: Float32,
+    balls: Float, leafy: Integer, first_id: int, view: View, samples: int, noise: Float32, nearness: Float32,
     ids: Integer32,
 ) -> None:  # fmt: skip
     """Draw ellipsoids; those marked ``leafy`` have a ragged outline with gaps.
@@ -192,89 +211,78 @@ def draw_balls(
         noise: tile in [0, 1].
     """
     rows, columns = nearness.shape
+    position, rotation = view.position, view.rotation
     for index in range(len(balls)):
-        ball = balls[index]
-        radius = max(ball[3], max(ball[4], ball[5]))
-        x = y = depth = 0.0
-        for axis in range(3):
-            offset = ball[axis] - view.position[axis]
-            x += offset * view.rotation[axis, 0]
-            y += offset * view.rotation[axis, 1]
-            depth += offset * view.rotation[axis, 2]
-        if depth < -radius:
+        radius = max(balls[index, 3], max(balls[index, 4], balls[index, 5]))
+        x, y, z = position[0] - balls[index, 0], position[1] - balls[index, 1], position[2] - balls[index, 2]
+        depth = -(x * rotation[0, 2] + y * rotation[1, 2] + z * rotation[2, 2])
+        su, sv, sw = _ball_space(balls, index, x, y, z)
+        outside = su * su + sv * sv + sw * sw - 1
+        if depth < -radius or outside < 0.02:
             continue
-        left, right, top, bottom = 0, columns, 0, rows
+        top, bottom = 0, rows
         if depth > 1.5 * radius:
             # The sphere around the ellipsoid, seen from outside: a bound that is never too small.
-            reach = radius * (1 + (abs(x) + abs(y)) / depth) / (depth - radius) * max(view.focal_x, view.focal_y)
-            middle_x, middle_y = x / depth * view.focal_x + view.centre_x, y / depth * view.focal_y + view.centre_y
-            if (
-                middle_x + reach < 0
-                or middle_x - reach > view.width
-                or middle_y + reach < 0
-                or middle_y - reach > view.height
-            ):
-                continue
-            left, right = max(0, int((middle_x - reach) * samples)), min(columns, int((middle_x + reach) * samples) + 1)
-            top, bottom = max(0, int((middle_y - reach) * samples)), min(rows, int((middle_y + reach) * samples) + 1)
-        elif x * x + y * y + depth * depth < 1.05 * radius * radius:
-            continue
+            down = -(x * rotation[0, 1] + y * rotation[1, 1] + z * rotation[2, 1])
+            across = -(x * rotation[0, 0] + y * rotation[1, 0] + z * rotation[2, 0])
+            reach = radius * (1 + (abs(across) + abs(down)) / depth) / (depth - radius) * view.focal_y
+            middle = down / depth * view.focal_y + view.centre_y
+            top, bottom = max(0, int((middle - reach) * samples)), min(rows, int((middle + reach) * samples) + 1)
+        gx, gy, gz = rotation[0, 0] / view.focal_x, rotation[1, 0] / view.focal_x, rotation[2, 0] / view.focal_x
+        eu, ev, ew = _ball_space(balls, index, gx, gy, gz)
+        eu, ev, ew = eu / samples, ev / samples, ew / samples
         for row in range(top, bottom):
-            for column in range(left, right):
-                pixel_x, pixel_y = (column + 0.5) / samples, (row + 0.5) / samples
-                hit = ball_depth(ball, view, pixel_x, pixel_y)
+            ray = pixel_ray(view, 0.5 / samples, (row + 0.5) / samples)
+            du, dv, dw = _ball_space(balls, index, ray[0], ray[1], ray[2])
+            # Along a row, the discriminant of the ray's equation is a parabola over the columns: solve for its span.
+            a0, a1, a2 = du * du + dv * dv + dw * dw, du * eu + dv * ev + dw * ew, eu * eu + ev * ev + ew * ew
+            b0, b1 = du * su + dv * sv + dw * sw, eu * su + ev * sv + ew * sw
+            p0, p1, p2 = b0 * b0 - a0 * outside, b0 * b1 - a1 * outside, b1 * b1 - a2 * outside
+            root = p1 * p1 - p0 * p2
+            if root <= 0:
+                continue
+            root = np.sqrt(root)
+            first, last = 0, columns
+            if p2 < 0:
+                first = max(0, int(np.ceil(max((-p1 + root) / p2, -1.0))))
+                last = min(columns, int(np.floor(min((-p1 - root) / p2, columns + 1.0))) + 1)
+            for column in range(first, last):
+                square, half = a0 + column * (2 * a1 + column * a2), b0 + column * b1
+                inside = half * half - square * outside
+                if inside < 0:
+                    continue
+                inside = np.sqrt(inside)
+                hit = (-half - inside) / square
                 if hit <= NEAR or 1 / hit <= nearness[row, column]:
                     continue
                 if leafy[index] == 1:
-                    across, down = (pixel_x - view.centre_x) / view.focal_x, (pixel_y - view.centre_y) / view.focal_y
-                    point = np.empty(3)
-                    for axis in range(3):
-                        point[axis] = (
-                            view.position[axis]
-                            - ball[axis]
-                            + hit
-                            * (view.rotation[axis, 0] * across + view.rotation[axis, 1] * down + view.rotation[axis, 2])
-                        )
-                    facing = 0.0
-                    length = 0.0
-                    for axis in range(3):
-                        towards = view.position[axis] - ball[axis] - point[axis]
-                        gradient = point[axis] / (ball[3 + axis] * ball[3 + axis])
-                        facing += towards * gradient
-                        length += gradient * gradient
-                    facing /= np.sqrt(length) * hit
-                    u = int(np.floor((point[0] + 0.6 * point[2]) * 9)) & 1023
-                    v = int(np.floor((point[1] - 0.7 * point[2]) * 9)) & 1023
-                    if noise[v, u] > 0.22 + 2.0 * facing:
+                    step = column / samples
+                    px, py, pz = (
+                        x + hit * (ray[0] + step * gx),
+                        y + hit * (ray[1] + step * gy),
+                        z + hit * (ray[2] + step * gz),
+                    )
+                    # sqrt(inside) / square is half the way through the crown, in rays: leaves are sparse at the rim.
+                    thickness = inside / np.sqrt(square)
+                    u = int(np.floor((px + 0.37 * py + 0.6 * pz) * 10)) & 1023
+                    v = int(np.floor((py - 0.37 * px - 0.7 * pz) * 10)) & 1023
+                    if noise[v, u] > 0.30 + 1.5 * thickness:
                         continue
                 nearness[row, column] = np.float32(1 / hit)
                 ids[row, column] = first_id + index
 
 
 @kernel
-def draw_mask(corners: Float, counts: NDArray[np.int64], view: View, value: int, mask: NDArray[np.uint8]) -> None:
+def draw_mask(corners: Float, counts: Integer, view: View, value: int, scratch: Float, mask: NDArray[np.uint8]) -> None:
     """Mark the pixels of flat polygons (shadows of what moves) in a mask ``(height, width)``."""
-    screen = np.empty((10, 2))
+    screen = scratch[8:]
     rows, columns = mask.shape
     for face in range(len(counts)):
-        count = _project_clipped(corners[face], counts[face], view, screen)
+        count = _project_clipped(corners[face], counts[face], view, scratch)
         if count < 3:
             continue
-        top, bottom = 1e30, -1e30
-        for index in range(count):
-            top, bottom = min(top, screen[index, 1]), max(bottom, screen[index, 1])
-        for row in range(
-            max(0, int(np.ceil(max(top, -1.0) - 0.5))), min(rows, int(np.ceil(min(bottom, rows + 1.0) - 0.5)))
-        ):
-            y = row + 0.5
-            low, high = 1e30, -1e30
-            for index in range(count):
-                following = index + 1 if index + 1 < count else 0
-                y0, y1 = screen[index, 1], screen[following, 1]
-                if (y0 <= y) != (y1 <= y):
-                    x = screen[index, 0] + (y - y0) / (y1 - y0) * (screen[following, 0] - screen[index, 0])
-                    low, high = min(low, x), max(high, x)
-            first = max(0, int(np.ceil(max(low, -1.0) - 0.5)))
-            last = min(columns, int(np.ceil(min(high, columns + 1.0) - 0.5)))
+        top, bottom = _rows_of(screen, count, rows)
+        for row in range(top, bottom):
+            first, last = _span(screen, count, row + 0.5, columns)
             for column in range(first, last):
                 mask[row, column] = min(mask[row, column], value)

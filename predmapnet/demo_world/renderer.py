@@ -157,7 +157,7 @@ class Renderer:
                 ]
                 corners[row, : len(kept), :2] = kept
                 counts[row] = len(kept)
-            draw_mask(corners, counts, view, value, mask)
+            draw_mask(corners, counts, view, value, np.empty((18, 3)), mask)
         return cv2.blur(mask, (3, 3)) if len(moving) else mask
 
     def view(self, camera: Camera, frame_index: int) -> View:
@@ -180,7 +180,7 @@ class Renderer:
         """Return the z-buffer of the solids: ``1 / depth`` and ids, ``(samples * height, samples * width)``."""
         nearness = np.zeros((view.height * samples, view.width * samples), dtype=np.float32)
         ids = np.full(nearness.shape, -1, dtype=np.int32)
-        draw_faces(mesh.corners, mesh.counts, mesh.normals, view, samples, nearness, ids)
+        draw_faces(mesh.corners, mesh.counts, mesh.normals, view, samples, np.empty((18, 3)), nearness, ids)
         leafy = (mesh.ball_materials == Material.FOLIAGE).astype(np.int64)
         draw_balls(mesh.balls, leafy, len(mesh.counts), view, samples, fractal_tile(0.6, seed=10), nearness, ids)
         return nearness, ids
@@ -212,7 +212,8 @@ class Renderer:
         image = np.empty((*size, 3), dtype=np.float32)
         depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
         dynamic = self._dynamic_mask(view, placed, moving)
-        shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, image, depth, ground_share)
+        found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
+        shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, found, scratch, image, depth, ground_share)
         if self.light.wetness > 0:
             mirror_in_wet(around, view, ground_share, image)
         image = cv2.GaussianBlur(image, (3, 3), 0.5 * camera.width / 800)
