@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import sys
 from functools import lru_cache
 from pathlib import Path
@@ -63,9 +64,17 @@ def scene_number(name: str) -> int:
     """The number of a scene, which is the seed of its town. Raises UserError for a name that does not exist."""
     names = {f"scene-{number:04d}": number for numbers in SPLITS.values() for number in numbers}
     if name not in names:
-        near = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
-        raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {', '.join(near)}.")
+        near = ", ".join(_nearest_names(name, names))
+        raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {near}.")
     return names[name]
+
+
+def _nearest_names(name: str, names: dict[str, int]) -> list[str]:
+    """By number where the name has one, otherwise by spelling."""
+    digits = re.search(r"\d+", name)
+    if digits:
+        return sorted(names, key=lambda candidate: abs(names[candidate] - int(digits.group())))[:3]
+    return difflib.get_close_matches(name, names, n=3, cutoff=0.0)
 
 
 def look_of(name: str) -> Look:

@@ -80,7 +80,7 @@ def _open_ring(ring: shapely.LinearRing) -> Float:
 def build_expansion(name: str, vector_map: VectorMap) -> dict[str, Any]:
     """The content of ``maps/expansion/<location>.json``.
 
-    Layers that a vector map knows nothing of (road blocks, lane connectors, traffic lights, lane paths) are empty.
+    Layers that a vector map knows nothing of (road blocks, lane connectors, traffic lights) are empty.
 
     Args:
         name: of the scene; tokens depend on it.
@@ -137,8 +137,11 @@ def build_expansion(name: str, vector_map: VectorMap) -> dict[str, Any]:
         "line": sheet.lines,
         "node": list(sheet.nodes.values()),
         **layers,
-        "arcline_path_3": {},
-        "connectivity": {},
+        "arcline_path_3": {
+            lane["token"]: _arcline_path(path)
+            for lane, path in zip(layers["lane"], vector_map.lane_paths, strict=False)
+        },
+        "connectivity": {lane["token"]: {"incoming": [], "outgoing": []} for lane in layers["lane"]},
     }
 
 
@@ -160,6 +163,25 @@ def _lane(sheet: _Sheet, index: int, lane: Polygon) -> Record:
         "left_lane_divider_segments": [],
         "right_lane_divider_segments": [],
     }
+
+
+def _arcline_path(path: Float) -> list[Record]:
+    """A lane path as straight pieces of the devkit's arc-line-arc primitive, within 3 cm of the path."""
+    corners = shapely.get_coordinates(shapely.LineString(path).simplify(0.03))
+    steps = np.diff(corners, axis=0)
+    lengths, headings = np.linalg.norm(steps, axis=1).tolist(), np.arctan2(steps[:, 1], steps[:, 0]).tolist()
+    return [
+        {
+            "start_pose": [*start, heading],
+            "end_pose": [*end, heading],
+            "shape": "LSL",
+            "radius": 999.999,
+            "segment_length": [0.0, length, 0.0],
+        }
+        for start, end, heading, length in zip(
+            corners[:-1].tolist(), corners[1:].tolist(), headings, lengths, strict=True
+        )
+    ]
 
 
 def _road_divider(sheet: _Sheet, index: int, divider: Divider, segment_token: str) -> Record:

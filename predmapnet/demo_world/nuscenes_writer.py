@@ -108,10 +108,9 @@ def _render_frames(world: World, root: Path, rig: Rig, progress: Progress | None
 
     def write_frame(index: int) -> None:
         timestamp = int(world.trajectory.timestamps[index])
-        for camera in rig:
-            image = renderer.render(camera, index).image
-            path = root / file_name(world.name, camera.name, timestamp)
-            _write_image(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+        for channel, rendered in renderer.render_frame(rig, index).items():
+            path = root / file_name(world.name, channel, timestamp)
+            _write_image(path, rendered.image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         _write_bytes(root / file_name(world.name, LIDAR, timestamp), scan(renderer, index).astype("<f4").tobytes())
 
     _in_threads(write_frame, count, lambda done: progress(done, count, f"rendering {world.name}") if progress else None)

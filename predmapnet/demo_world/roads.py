@@ -87,7 +87,8 @@ class Road:
     def direction(self, stations: Float) -> Float:
         """Unit tangents ``(n, 2)`` at stations ``(n,)``."""
         tangents = np.stack([np.interp(stations, self.stations, self.tangents[:, axis]) for axis in range(2)], axis=1)
-        return tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+        unit: Float = tangents / np.linalg.norm(tangents, axis=1, keepdims=True)
+        return unit
 
     def line(self, start: float, end: float, offset: float = 0.0) -> Float:
         """Parallel line ``(n, 2)`` between two stations (in either order), a vertex about every two metres."""

@@ -214,7 +214,8 @@ def _lane_line(town: Town, leg: Leg, first: Arm, last: Arm, lane_in: int, lane_o
 
 def _trimmed(line: Float, front: float, back: float) -> Float:
     travelled = arc_length(line)
-    return line[(travelled >= front) & (travelled <= travelled[-1] - back)]
+    kept: Float = line[(travelled >= front) & (travelled <= travelled[-1] - back)]
+    return kept
 
 
 def _stop_point(lane_line: Float, arm: Arm) -> Float:
@@ -262,7 +263,7 @@ def _turn(start: Float, start_direction: Float, end: Float, end_direction: Float
 
 def _arc(start: Float, first: Float, end: Float, last: Float) -> Float:
     """A cubic Bezier curve between two places and directions (unit length), near a circular arc where one fits."""
-    angle = max(np.arccos(np.clip(first @ last, -1.0, 1.0)), 1e-3)
+    angle = max(float(np.arccos(np.clip(first @ last, -1.0, 1.0))), 1e-3)
     handle = 4 / 3 * np.tan(angle / 4) / (2 * np.sin(angle / 2)) * np.linalg.norm(end - start)
     t = np.linspace(0.0, 1.0, 40)[:, None]
     controls = (start, start + handle * first, end - handle * last, end)
@@ -309,7 +310,8 @@ def _drive_along(random: Generator, path: Float, stops: Float, cruise: float) ->
         # Standing still: the same place at two times.
         times = np.insert(times, index + 1, times[index] + waits[index])
         stations = np.insert(stations, index + 1, stations[index])
-    return np.interp(FRAME_SECONDS * np.arange(KEY_FRAMES), times, stations)
+    reached: Float = np.interp(FRAME_SECONDS * np.arange(KEY_FRAMES), times, stations)
+    return reached
 
 
 def _reachable(limit: Float) -> Float:
@@ -319,4 +321,5 @@ def _reachable(limit: Float) -> Float:
         squared[index] = min(squared[index], squared[index - 1] + 2 * ACCELERATION_LIMIT * PATH_STEP)
     for index in range(len(squared) - 2, -1, -1):
         squared[index] = min(squared[index], squared[index + 1] + 2 * BRAKING_LIMIT * PATH_STEP)
-    return np.sqrt(squared)
+    speed: Float = np.sqrt(squared)
+    return speed

@@ -51,7 +51,7 @@ class _Works:
     widenings: list[Polygon] = field(default_factory=list)
     parking: list[Polygon] = field(default_factory=list)
     stop_lines: list[Polygon] = field(default_factory=list)
-    lanes: list[Polygon] = field(default_factory=list)
+    lanes: list[tuple[Polygon, Float]] = field(default_factory=list)
     grass: list[Polygon] = field(default_factory=list)
 
 
@@ -110,7 +110,7 @@ def _build_arm(
     edge = plan.edges[index]
     node = edge.nodes[0 if side == 1 else 1]
     if node < 0:
-        return Arm(index, side, -1, 0.0, (0.0, 0.0), 0.0)
+        return Arm(index, side, -1, 0.0, (0.0, 0.0), stop=3.0)
     road = plan.roads[edge.road]
     section = road.section
     clear = clear_distance(plan, pavement, index, side)
@@ -182,7 +182,7 @@ def _build_stretch(
         depth = float(random.uniform(3.0, 4.5))
         skew = np.tan(np.radians(_draw_skew(random)))
         works.crossings.append(_crossing(random, road, middle - depth / 2, middle + depth / 2, skew, habits))
-        clearance = depth / 2 + abs(skew) * section.half_width * 0.5
+        clearance = depth / 2 + abs(skew) * section.lane_edge(section.lanes - 1)
         cuts = [begin, middle - clearance, middle + clearance, finish]
     free = list(zip(cuts[0::2], cuts[1::2], strict=True))
     through_median = random.random() < 0.5
@@ -196,7 +196,9 @@ def _build_stretch(
     for side in (-1, 1):
         for lane in range(section.lanes):
             laterals = sorted((side * section.lane_edge(lane), side * section.lane_edge(lane + 1)))
-            works.lanes.append(road.strip(inner_first, inner_last, *laterals))
+            ends = (inner_last, inner_first) if side == 1 else (inner_first, inner_last)
+            path = road.line(*ends, side * section.lane_centre(lane))
+            works.lanes.append((road.strip(inner_first, inner_last, *laterals), path))
         if random.random() < habits.grass_share:
             laterals = sorted((side * (section.half_width - 0.5), side * (section.half_width + 5.0)))
             works.grass.append(road.strip(inner_first + 2.0, inner_last - 2.0, *laterals))
@@ -262,11 +264,12 @@ def _assemble(
         inset = [start + 0.2 if first.node >= 0 else -2.0, end - 0.2 if last.node >= 0 else road.length + 2.0]
         cutters.append(road.strip(inset[0], inset[1], -reach, reach))
     junctions = parts(surface.difference(shapely.union_all(cutters)), 0.5)
+    lanes = [(part, path) for lane, path in works.lanes for part in parts(lane.difference(islands), 0.5)]
     walkways = outline.buffer(habits.walkway_width, quad_segs=6).difference(outline)
     walkways = walkways.difference(shapely.union_all(works.grass)) if works.grass else walkways
     return VectorMap(
         road_segments=tuple(stretches + junctions),
-        lanes=tuple(part for lane in works.lanes for part in parts(lane.difference(islands), 0.5)),
+        lanes=tuple(lane for lane, _ in lanes),
         crossings=tuple(
             Crossing(part, crossing.style, crossing.heading)
             for crossing in works.crossings
@@ -276,4 +279,5 @@ def _assemble(
         walkways=tuple(parts(walkways, 2.0)),
         parking=tuple(works.parking),
         stop_lines=tuple(works.stop_lines),
+        lane_paths=tuple(path for _, path in lanes),
     )

@@ -99,7 +99,8 @@ def _bent_grid(random: Generator, rows: int, columns: int) -> Float:
     def ticks(count: int) -> Float:
         gaps = random.uniform(74.0, 92.0, count - 1) if count == 3 else random.uniform(88.0, 112.0, count - 1)
         inner = np.concatenate([[0.0], np.cumsum(gaps)])
-        return np.concatenate([[-65.0], inner, [inner[-1] + 65.0]]) - inner[-1] / 2
+        outer: Float = np.concatenate([[-65.0], inner, [inner[-1] + 65.0]]) - inner[-1] / 2
+        return outer
 
     x, y = np.meshgrid(ticks(columns), ticks(rows))
     knots = np.stack([x, y], axis=-1)

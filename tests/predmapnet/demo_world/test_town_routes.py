@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+import shapely
+
+from predmapnet.demo_world.catalogue import scene_infos, town_of, trajectory
+
+NAMES = [info.name for split in ("test", "val") for info in scene_infos(split)] + [
+    info.name for info in scene_infos("train")[:20]
+]
+
+
+def heading(poses):
+    return np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def drives():
+    return {name: trajectory(name) for name in NAMES}
+
+
+def test_the_same_scene_is_driven_the_same_way(drives):
+    again = trajectory("scene-0103")
+    assert again.ego_to_global.tobytes() == drives["scene-0103"].ego_to_global.tobytes()
+    assert again.timestamps.tobytes() == drives["scene-0103"].timestamps.tobytes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_poses_are_rigid_and_half_a_second_apart(name, drives):
+    drive = drives[name]
+    poses = drive.ego_to_global
+    assert poses.shape == (40, 4, 4)
+    assert (np.diff(drive.timestamps) == 500_000_000).all()
+    assert (drive.timestamps % 1000 == 0).all()
+    np.testing.assert_allclose(
+        poses[:, :3, :3] @ poses[:, :3, :3].swapaxes(1, 2), np.tile(np.eye(3), (40, 1, 1)), atol=1e-12
+    )
+    np.testing.assert_array_equal(poses[:, 2, 3], 0.0)
+    assert np.degrees(np.arccos(poses[:, 2, 2])).max() < 0.8
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_car_stays_on_the_road_and_out_of_the_way_of_oncoming_cars(name, drives):
+    town = town_of(name)
+    lanes, paths = town.vector_map.lanes, town.vector_map.lane_paths
+    surface = shapely.union(shapely.union_all(town.vector_map.road_segments), shapely.union_all(lanes))
+    tree = shapely.STRtree(lanes)
+    poses = drives[name].ego_to_global
+    rear_axle = np.stack([poses[:, :2, 3] + side * 0.8 * poses[:, :2, 1] for side in (-1, 1)])
+    assert surface.buffer(0.05).contains(shapely.MultiPoint(rear_axle.reshape(-1, 2)))
+    for pose in poses:
+        for lane in tree.query(shapely.Point(pose[:2, 3]), predicate="within"):
+            nearest = int(np.argmin(np.linalg.norm(paths[lane][:-1] - pose[:2, 3], axis=1)))
+            along = paths[lane][nearest + 1] - paths[lane][nearest]
+            assert along @ pose[:2, 0] > 0.8 * np.linalg.norm(along), "the car drives against the traffic"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_person_could_drive_like_that(name, drives):
+    poses = drives[name].ego_to_global
+    steps = np.diff(poses[:, :2, 3], axis=0)
+    speed = np.linalg.norm(steps, axis=1) / 0.5
+    turned = np.abs(np.angle(np.exp(1j * np.diff(heading(poses)))))
+    assert speed.max() < 12.1
+    assert speed.mean() > 3.0
+    assert np.abs(np.diff(speed) / 0.5).max() < 2.6
+    assert (turned / 0.5 * speed).max() < 3.2, "sideways acceleration"
+    moving = speed > 1.0
+    course = np.arctan2(steps[:, 1], steps[:, 0])
+    middle = heading(poses)[:-1] + np.angle(np.exp(1j * np.diff(heading(poses)))) / 2
+    assert np.abs(np.angle(np.exp(1j * (course - middle))))[moving].max() < np.radians(6.0)
+
+
+def test_drives_turn_stop_and_never_see_the_end_of_the_world(drives):
+    turning = [
+        np.degrees(np.abs(np.angle(np.exp(1j * np.diff(heading(drive.ego_to_global)))).sum()))
+        for drive in drives.values()
+    ]
+    assert np.mean(np.array(turning) > 45.0) > 0.4
+    standing = [
+        (np.linalg.norm(np.diff(drive.ego_to_global[:, :2, 3], axis=0), axis=1) < 0.05).any()
+        for drive in drives.values()
+    ]
+    assert 0.05 < np.mean(standing) < 0.8
+    for name, drive in drives.items():
+        plan = town_of(name).plan
+        ends = [plan.roads[edge.road].points[-1 if edge.nodes[1] < 0 else 0] for edge in plan.edges if edge.leaves_town]
+        gaps = np.linalg.norm(drive.ego_to_global[:, None, :2, 3] - np.array(ends), axis=2)
+        assert gaps.min() > 38.0
+
+
+def test_there_is_enough_to_see_around_the_car(drives):
+    crossings, dividers, boundaries = [], [], []
+    for name, drive in drives.items():
+        town_map = town_of(name).vector_map
+        surface = shapely.union(shapely.union_all(town_map.road_segments), shapely.union_all(town_map.lanes))
+        for pose in drive.ego_to_global[::4]:
+            corners = np.array([[-30, -15], [30, -15], [30, 15], [-30, 15]]) @ pose[:2, :2].T + pose[:2, 3]
+            roi = shapely.Polygon(corners)
+            crossings.append(sum(roi.intersection(crossing.polygon).area > 5 for crossing in town_map.crossings))
+            lengths = [roi.intersection(shapely.LineString(line.points)).length for line in town_map.dividers]
+            dividers.append(sum(length > 2 for length in lengths))
+            boundaries.append(len(shapely.get_parts(roi.buffer(-0.2).intersection(surface.boundary))))
+    assert 0.6 < np.mean(np.array(crossings) > 0) < 0.97
+    assert 2.0 < np.mean(dividers) < 7.0
+    assert 2.0 < np.mean(boundaries) < 7.0
