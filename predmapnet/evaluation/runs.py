@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -47,7 +48,7 @@ class EvaluationSettings:
     results: Path | None = None
     weights: Path | None = None
     device: str = "auto"
-    roi: RegionOfInterest = RegionOfInterest()
+    roi: RegionOfInterest = field(default_factory=RegionOfInterest)
     threads: int = 1
 
 
@@ -70,9 +71,9 @@ def scenes_to_measure(settings: EvaluationSettings, source: SceneSource, split: 
         return sorted(held)
     missing = [scene for scene in wanted if scene not in held]
     if missing:
+        named = ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
         raise UserError(
-            f"{settings.results} lacks {len(missing)} of {len(wanted)} scenes of the split {split}: {', '.join(missing[:5])}"
-            f"{' ...' if len(missing) > 5 else ''}."
+            f"{settings.results} lacks {len(missing)} of {len(wanted)} scenes of the split {split}: {named}"
         )
     return wanted
 
@@ -96,29 +97,35 @@ def measure_scenes(
             yield _measure(settings, scene, preparing)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=use_threads, initargs=(settings.threads,)) as pool:
-        try:
-            futures = [pool.submit(_measure, settings, scene) for scene in scenes]
-            for future in futures:
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(settings.threads,))
+    try:
+        futures = [pool.submit(_measure, settings, scene) for scene in scenes]
+        for future in futures:
+            yield future.result()
+    except BaseException:
+        workers = list((getattr(pool, "_processes", None) or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.terminate()
+        raise
+    pool.shutdown()
+
+
+def _begin_worker(threads: int) -> None:
+    # Ctrl-C is the parent's business; it ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_threads(threads)
 
 
 def _measure(settings: EvaluationSettings, name: str, preparing: Progress | None = None) -> SceneMeasurement:
     scene = _source(settings).open(name, preparing)
-    seconds = None
     if settings.results is None:
         from predmapnet.streaming import map_scene
 
         run = map_scene(scene, _mapper(settings))
-        frame_maps, global_map, seconds = list(run.frame_maps), run.global_map, run.seconds
-    else:
-        frame_maps = _stored_maps(settings.results, settings.roi, scene)
-        global_map = _integrated(name, frame_maps)
-    frames = [_with_truth(scene, index, frame_map) for index, frame_map in enumerate(frame_maps)]
-    return measure_scene(frames, global_map, scene.truth_map(), seconds)
+        return measure_scene(_with_truth(scene, run.frame_maps), run.global_map, scene.truth_map(), run.seconds)
+    frame_maps = _stored_maps(settings.results, settings.roi, scene)
+    return measure_scene(_with_truth(scene, frame_maps), _integrated(name, frame_maps), scene.truth_map())
 
 
 @lru_cache(maxsize=1)
@@ -144,7 +151,8 @@ def _scenes_in(results: Path, source: SceneSource, wanted: Sequence[str]) -> set
         names = {path.stem for path in results.glob("*.parquet")}
         if not names:
             raise UserError(
-                f"The folder {results} holds no per-frame results (*.parquet); map with 'predmapnet batch --save-frames'."
+                f"The folder {results} holds no per-frame results (*.parquet); "
+                "make them with 'predmapnet batch --save-frames'."
             )
         return names
     if results.suffix == ".json":
@@ -194,8 +202,11 @@ def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
     return integrator.map()
 
 
-def _with_truth(scene: Scene, index: int, frame_map: FrameMap) -> EvaluationFrame:
-    truth = scene.truth(index, frame_map.roi)
-    if truth is None:
-        raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
-    return EvaluationFrame(scene.info.name, index, frame_map, truth)
+def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap]) -> list[EvaluationFrame]:
+    frames = []
+    for index, frame_map in enumerate(frame_maps):
+        truth = scene.truth(index, frame_map.roi)
+        if truth is None:
+            raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
+        frames.append(EvaluationFrame(scene.info.name, index, frame_map, truth))
+    return frames

@@ -1,0 +1,114 @@
+"""All metrics of a scene together, the report that is made of them, and what holds for any input."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
+from mapfusion.geometry import transform_points
+from predmapnet.datasets.source import FrameTruth
+from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.measurement import measure_scene, pool_scenes
+from predmapnet.evaluation.report import write_figures, write_report
+
+RING = np.array([[10.0, -3.0], [14.0, -3.0], [14.0, 5.0], [10.0, 5.0], [10.0, -3.0]])
+CONTEXT = {"dataset": "demo", "split": "test", "synthetic": True}
+
+
+def drive(count=6, speed=2.0, offset=0.0, switch_at=None):
+    """A straight drive past a crossing, with a kerb and an oblique divider; every element predicted exactly."""
+    frames = []
+    world = [RING, np.array([[-40.0, 9.0], [80.0, 9.0]]), np.array([[-25.0, -12.0], [25.0, 10.0]])]
+    kinds = np.array([0, 2, 1])
+    for index in range(count):
+        pose = np.eye(4)
+        pose[0, 3] = speed * index
+        global_to_ego = np.linalg.inv(pose)
+        following = np.linalg.inv(pose)
+        following[0, 3] -= speed
+        lines = tuple(transform_points(global_to_ego, line) for line in world)
+        ids = np.array([0, 1, 2]) + (10 if switch_at is not None and index >= switch_at else 0)
+        predicted = FrameMap(
+            timestamp=index,
+            ego_to_global=pose,
+            roi=RegionOfInterest(),
+            kinds=kinds,
+            scores=np.array([0.9, 0.8, 0.7]),
+            track_ids=ids,
+            polylines=tuple(line + np.array([0.0, offset]) for line in lines),
+            forecasts=tuple(transform_points(following, line) for line in world),
+        )
+        truth = FrameTruth(kinds, lines, np.arange(3))
+        frames.append(EvaluationFrame("scene-0001", index, predicted, truth))
+    elements = tuple(MapElement(ElementKind(kind), line, 0.9, 3, 0, 1) for kind, line in zip(kinds, world, strict=True))
+    return frames, GlobalMap(elements)
+
+
+def test_perfect_predictions_are_perfect_by_every_measure():
+    frames, truth_map = drive()
+    figures = pool_scenes([measure_scene(frames, truth_map, truth_map, 3.0)]).figures()
+    for metric in ("chamfer_ap", "consistency_ap", "consistency_ap_formed_ids", "raster_ap"):
+        assert figures[metric]["mAP"] == pytest.approx(1.0), metric
+    assert figures["global_map"]["f1@1.0"] == pytest.approx(1.0)
+    assert figures["tracks"]["id_switches"] == 0
+    assert figures["tracks"]["tracked_share"] == 1.0
+    assert figures["frames_per_second"] == pytest.approx(2.0)
+
+
+def test_ids_that_change_cost_consistency_only():
+    frames, _ = drive(switch_at=3)
+    figures = pool_scenes([measure_scene(frames)]).figures()
+    assert figures["chamfer_ap"]["mAP"] == pytest.approx(1.0)
+    assert figures["consistency_ap"]["mAP_without_consistency"] == pytest.approx(1.0)
+    # Half of the frames keep the anchored id; the other half are false positives of equal score.
+    assert figures["consistency_ap"]["mAP"] == pytest.approx(0.5)
+    assert figures["consistency_ap_formed_ids"]["mAP"] == pytest.approx(1.0)
+    assert figures["tracks"]["id_switches"] == 3
+
+
+def test_a_forecast_that_knows_the_motion_beats_the_constant_position():
+    frames, _ = drive()
+    forecast = pool_scenes([measure_scene(frames)]).figures()["forecast"]
+    for horizon, steps in (("t+1", 1), ("t+2", 2)):
+        assert forecast[horizon]["forecast_mean_m"] == pytest.approx(0.0, abs=1e-9)
+        assert forecast[horizon]["constant_position_mean_m"] == pytest.approx(2.0 * steps, abs=0.2)
+        # It moves the lines as well, but clips them to the ROI, which the unclipped truth here does not.
+        assert forecast[horizon]["ego_motion_median_m"] < forecast[horizon]["constant_position_median_m"]
+
+
+def test_without_tracks_the_formed_ids_stand_in():
+    frames, _ = drive()
+    untracked = [replace(frame, predicted=replace(frame.predicted, track_ids=np.full(3, -1))) for frame in frames]
+    figures = pool_scenes([measure_scene(untracked)]).figures()
+    assert figures["consistency_ap"]["ids"] == "formed"
+    assert figures["consistency_ap"]["mAP"] == pytest.approx(1.0)
+    assert figures["global_map"] is None and figures["forecast"]["t+1"]["count"] == 0
+
+
+def test_the_report_needs_nothing_else_and_the_json_has_the_promised_keys(tmp_path):
+    frames, truth_map = drive(offset=0.7)
+    measurement = pool_scenes([measure_scene(frames, truth_map, truth_map)])
+    write_report(tmp_path / "report.html", measurement, CONTEXT)
+    html = (tmp_path / "report.html").read_text()
+    assert not re.findall(r"(?:src|href|url)\s*[=(]", html)
+    assert html.count("<svg") >= 3 + 2 + 2 * len(frames)
+    write_figures(tmp_path / "figures.json", measurement.figures(), CONTEXT)
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["evaluated"]["split"] == "test"
+    for metric in ("chamfer_ap", "consistency_ap", "raster_ap"):
+        assert 0.0 <= figures[metric]["mAP"] <= 1.0
+    assert figures["global_map"]["f1@1.0"] == pytest.approx(1.0)
+    assert set(figures["chamfer_ap"]["divider"]) >= {"AP", "AP@0.5", "AP@1.0", "AP@1.5"}
+
+
+def test_the_same_scenes_give_the_same_bytes(tmp_path, case):
+    for name in ("a", "b"):
+        scene = [frame for frame in case.frames if frame.scene == case.frames[0].scene]
+        measurement = pool_scenes([measure_scene(scene)])
+        write_figures(tmp_path / name, measurement.figures(), CONTEXT)
+        write_report(tmp_path / f"{name}.html", measurement, CONTEXT)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
