@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,7 @@ from mapfusion.rings import (
     sight,
 )
 from mapfusion.spatial import TileIndex
+from mapfusion.state import load_state, save_state
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
@@ -57,6 +60,7 @@ class MapIntegrator:
         self.rings: dict[int, FusedRing] = {}
         self.index = TileIndex()
         self.next_id = 0
+        self.frames = 0
         self._clean: dict[int, list[MapElement]] = {}
         self._dirty: set[int] = set()
 
@@ -77,6 +81,7 @@ class MapIntegrator:
             self.rejections[problem] += 1
             return
         lines, rings = observe(frame_map, self.config, self.rejections)
+        self.frames += 1
         self.views.add(frame_map.ego_to_global, frame_map.roi)
         reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + 2.0
         low, high = frame_map.ego_to_global[:2, 3] - reach, frame_map.ego_to_global[:2, 3] + reach
@@ -98,7 +103,29 @@ class MapIntegrator:
                 self._clean.pop(element, None)
         self._dirty.clear()
         elements = (element for key in sorted(self._clean) for element in self._clean[key])
-        return GlobalMap(tuple(elements))
+        return GlobalMap(tuple(elements), {"frames": self.frames, "integrator": asdict(self.config)})
+
+    def save(self, path: Path) -> None:
+        """Write the state to a ``.npz`` file, to go on later with :meth:`load`; raises OSError."""
+        save_state(self, path)
+
+    @classmethod
+    def load(cls, path: Path) -> MapIntegrator:
+        """Return the integrator that :meth:`save` wrote; raises ValueError for other files, OSError."""
+        integrator = cls()
+        load_state(integrator, path)
+        return integrator
+
+    def put_line(self, element: int, line: FusedLine) -> None:
+        """File a line under an id of its own."""
+        self.lines[element] = line
+        self.index.put(element, line.curve.points)
+        self._dirty.add(element)
+
+    def put_ring(self, element: int, ring: FusedRing) -> None:
+        """File a crossing under an id of its own."""
+        self.rings[element] = ring
+        self._file_ring(element)
 
     def _add_lines(
         self, observations: list[Observation], known: dict[int, FusedLine], low: Float, high: Float, timestamp: int
@@ -165,9 +192,7 @@ class MapIntegrator:
 
     def _new_line(self, observation: Observation, curve: Curve, timestamp: int) -> None:
         evidence = Evidence(timestamp, timestamp, tracks={observation.track_id: 1})
-        self.lines[self.next_id] = FusedLine(observation.kind, curve, evidence)
-        self.index.put(self.next_id, curve.points)
-        self._dirty.add(self.next_id)
+        self.put_line(self.next_id, FusedLine(observation.kind, curve, evidence))
         self.next_id += 1
 
     def _merge_lines(self, first: int, second: int) -> None:
@@ -196,9 +221,7 @@ class MapIntegrator:
                     other.evidence.observations,
                     dict(other.evidence.tracks),
                 )
-                self.lines[self.next_id] = FusedLine(other.kind, piece, evidence)
-                self.index.put(self.next_id, piece.points)
-                self._dirty.add(self.next_id)
+                self.put_line(self.next_id, FusedLine(other.kind, piece, evidence))
                 self.next_id += 1
 
     def _add_rings(self, observations: list[Observation], near: list[int], frame_map: FrameMap) -> None:
@@ -219,8 +242,7 @@ class MapIntegrator:
         chosen = assign(options)
         for sighting, (low, high), row, element in zip(sightings, rooms, options, chosen, strict=True):
             if element is None:
-                self.rings[self.next_id] = new_ring(sighting.crop(low, high), frame_map.timestamp)
-                self._file_ring(self.next_id)
+                self.put_ring(self.next_id, new_ring(sighting.crop(low, high), frame_map.timestamp))
                 self.next_id += 1
                 continue
             ring = self.rings[element]

@@ -38,6 +38,8 @@ def view_weight(points_ego: Float, roi: RegionOfInterest, config: IntegratorConf
 class ViewGrid:
     """Sum of the view weights of all frames per cell of one square metre, in tiles that appear on demand."""
 
+    side = TILE_CELLS
+
     def __init__(self, config: IntegratorConfig) -> None:
         self.config = config
         self.tiles: dict[Tile, NDArray[np.float32]] = {}

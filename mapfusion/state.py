@@ -1,0 +1,144 @@
+"""The integrator's state on disk: arrays and JSON in one ``.npz`` file, no pickle."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.config import IntegratorConfig
+from mapfusion.elements import ElementKind
+from mapfusion.lines import Curve, Evidence, FusedLine
+from mapfusion.rings import FusedRing
+
+if TYPE_CHECKING:
+    from mapfusion.integrator import MapIntegrator
+
+FORMAT = 1
+"""Version of the file's layout; files of another version are refused."""
+
+Item = TypeVar("Item")
+
+
+def save_state(integrator: MapIntegrator, path: Path) -> None:
+    """Write everything an integrator knows; the file appears complete or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    lines, rings, tiles = integrator.lines, integrator.rings, integrator.views.tiles
+    curves = [line.curve for line in lines.values()]
+    header = {
+        "format": FORMAT,
+        "config": asdict(integrator.config),
+        "rejections": dict(integrator.rejections),
+        "frames": integrator.frames,
+        "next_id": integrator.next_id,
+        "logs": integrator.journal.logs,
+        "lines": [
+            {"id": i, "kind": int(line.kind), "count": len(line.curve), "evidence": _plain(line.evidence)}
+            for i, line in lines.items()
+        ],
+        "rings": [
+            {
+                "id": i,
+                "corner": ring.corner.tolist(),
+                "shape": ring.looked.shape,
+                "seen": ring.seen,
+                "evidence": _plain(ring.evidence),
+            }
+            for i, ring in rings.items()
+        ],
+        "tiles": list(tiles),
+    }
+    arrays = {
+        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+        "points": _flat(curves, lambda curve: curve.points.ravel(), np.float64),
+        "information": _flat(curves, lambda curve: curve.information, np.float64),
+        "seen": _flat(curves, lambda curve: curve.seen, np.float64),
+        "seen_view": _flat(curves, lambda curve: curve.seen_view, np.float64),
+        "ring_distance": _flat(rings.values(), lambda ring: ring.distance.ravel(), np.float32),
+        "ring_looked": _flat(rings.values(), lambda ring: ring.looked.ravel(), np.float32),
+        "ring_seen_view": _flat(rings.values(), lambda ring: ring.seen_view.ravel(), np.float32),
+        "views": _flat(tiles.values(), lambda tile: tile.ravel(), np.float32),
+    }
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def load_state(integrator: MapIntegrator, path: Path) -> None:
+    """Fill an empty integrator with what a file of :func:`save_state` holds.
+
+    Raises:
+        ValueError: not such a file.
+        OSError: the file cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(arrays["header"].tobytes())
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{path}: not the saved state of a map integrator: {error}") from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: layout {header.get('format')} of another version; this one reads {FORMAT}")
+    _restore(integrator, header, arrays)
+
+
+def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    integrator.config = IntegratorConfig(**header["config"])
+    integrator.views.config = integrator.config
+    integrator.rejections = Counter(header["rejections"])
+    integrator.frames, integrator.next_id = header["frames"], header["next_id"]
+    integrator.journal.logs = {
+        log: (times, [(x, y) for x, y in positions]) for log, (times, positions) in header["logs"].items()
+    }
+    points = arrays["points"].reshape(-1, 2)
+    at = 0
+    for entry in header["lines"]:
+        part = slice(at, at + entry["count"])
+        curve = Curve(points[part], arrays["information"][part], arrays["seen"][part], arrays["seen_view"][part])
+        line = FusedLine(ElementKind(entry["kind"]), curve, _evidence(entry["evidence"]))
+        integrator.put_line(entry["id"], line)
+        at = part.stop
+    at = 0
+    for entry in header["rings"]:
+        shape = tuple(entry["shape"])
+        part = slice(at, at + shape[0] * shape[1])
+        distance, looked, seen_view = (
+            arrays[name][part].reshape(shape) for name in ("ring_distance", "ring_looked", "ring_seen_view")
+        )
+        corner = np.array(entry["corner"], dtype=np.int64)
+        ring = FusedRing(corner, distance, looked, seen_view, entry["seen"], _evidence(entry["evidence"]))
+        integrator.put_ring(entry["id"], ring)
+        at = part.stop
+    tiles = [(int(row), int(column)) for row, column in header["tiles"]]
+    side = integrator.views.side
+    integrator.views.tiles = dict(zip(tiles, arrays["views"].reshape(len(tiles), side, side).copy(), strict=True))
+
+
+def _flat(items: Iterable[Item], part: Callable[[Item], NDArray[Any]], dtype: type) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0, dtype), *(part(item) for item in items)])
+
+
+def _plain(evidence: Evidence) -> list[Any]:
+    tracks, beside = ([list(pair) for pair in counts.items()] for counts in (evidence.tracks, evidence.beside))
+    return [evidence.first_seen, evidence.last_seen, evidence.observations, tracks, beside]
+
+
+def _evidence(plain: list[Any]) -> Evidence:
+    first, last, observations, tracks, beside = plain
+    return Evidence(first, last, observations, {k: v for k, v in tracks}, {k: v for k, v in beside})
