@@ -5,9 +5,13 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
+
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.opt
         {"params": [p for p in parameters if p.ndim >= 2], "weight_decay": settings.weight_decay},
         {"params": [p for p in parameters if p.ndim < 2], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas)
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas, fused=True)
 
 
 def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> float:
@@ -46,7 +50,7 @@ def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> fl
     return settings.learning_rate * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
 
 
-class WeightAverage:
+class WeightAverage(Generic[Network]):
     """Exponential moving average of a network's parameters and buffers.
 
     The decay starts low, ``(1 + updates) / (10 + updates)``, so that the average soon forgets the random start.
@@ -56,8 +60,8 @@ class WeightAverage:
         updates: how often it was updated.
     """
 
-    def __init__(self, network: nn.Module, decay: float) -> None:
-        self.network = copy.deepcopy(network).eval().requires_grad_(False)
+    def __init__(self, network: Network, decay: float) -> None:
+        self.network: Network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay = decay
         self.updates = 0
 

@@ -23,6 +23,7 @@ from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
 from predmapnet.training.validation import validate
 from predmapnet.training.workers import Workers
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 
 Report = Callable[[str], None]
 
@@ -88,10 +89,10 @@ def train(options: RunOptions, report: Report = print) -> Path | None:
             process.join()
     finally:
         meeting_point.unlink(missing_ok=True)
-    return export(options.folder, options.config) if finished else None
+    return export(options.folder, options.config, options.data) if finished else None
 
 
-def export(folder: Path, config: PredMapNetConfig) -> Path:
+def export(folder: Path, config: PredMapNetConfig, data: str) -> Path:
     """Write the averaged weights of the newest checkpoint in ``folder`` as a file of their own.
 
     Raises:
@@ -103,7 +104,11 @@ def export(folder: Path, config: PredMapNetConfig) -> Path:
     network = PredMapNet(config)
     average = checkpoint.below_prefix("average", checkpoint.read(newest, "network"))
     checkpoint.load_weights(network, average, newest)
-    return checkpoint.write_weights(folder / WEIGHTS, network, checkpoint.read_json(newest / "position.json"))
+    position = checkpoint.read_json(newest / "position.json")
+    facts = {name: position[name] for name in ("frames", "finished", "cpu_seconds")}
+    path = folder / WEIGHTS
+    save_checkpoint(path, network, {"data": data, **facts})
+    return path
 
 
 def _other_process(options: RunOptions, rank: int, meeting_point: Path) -> None:
@@ -126,7 +131,7 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
     torch.manual_seed(settings.seed)
     network = PredMapNet(options.config)
     if options.initial is not None and not options.resume:
-        checkpoint.load_weights(network, checkpoint.read_weights(options.initial), options.initial)
+        checkpoint.load_weights(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
     trainer = Trainer(network, settings, options.folder, workers, report)
     if options.resume:
         trainer.resume()

@@ -163,7 +163,7 @@ class StreamClips:
             scene[stream] = generator.integers(len(self._scenes.scenes))
             available = len(self._scenes.scenes[scene[stream]])
             grown = count + (self._settings.longest - count) * min(1.0, step / self._settings.growth_steps)
-            length = min(available, generator.integers(count, int(grown) + 1))
+            length = min(available, int(generator.integers(count, int(grown) + 1)))
             frame[stream] = generator.integers(0, available - length + 1)
             end[stream] = frame[stream] + length
         return StreamPlan(scene, frame, end), fresh

@@ -70,8 +70,8 @@ class TemporalStage:
             if module is not None:
                 module.requires_grad_(False)
         config = self._network.config
-        sizes = ((config.bev.rows, config.bev.columns),)
-        sizes += tuple((-(-sizes[0][0] // scale), -(-sizes[0][1] // scale)) for scale in (2, 4))
+        # Halved sizes are rounded up.
+        sizes = [(-(-config.bev.rows // scale), -(-config.bev.columns // scale)) for scale in (1, 2, 4)]
         shapes = tuple((width, *size) for width, size in zip(config.bev.widths, sizes, strict=True))
         store = FeatureStore(self._folder / self._fingerprint(), shapes)
         self._fill(store)

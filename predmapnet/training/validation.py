@@ -81,7 +81,7 @@ def _frame_map(selection: Selection, ego_to_global: Float, config: PredMapNetCon
         torch.cat([getattr(part, name)[0][rows] for part, rows in zip(parts, kept, strict=True)]).numpy()
         for name in ("labels", "scores", "track_ids", "points")
     )
-    lines = (points.astype(np.float64) - 0.5) * config.roi.size
+    lines = (points.clip(0.0, 1.0).astype(np.float64) - 0.5) * config.roi.size
     rings = kinds == ElementKind.PED_CROSSING
     lines[rings, -1] = lines[rings, 0]
     return FrameMap(
