@@ -17,6 +17,7 @@ from pyarrow import ArrowInvalid, feather
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
+from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
@@ -229,6 +230,13 @@ class Argoverse2Scene:
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the official ground truth of frame ``index``, or None for a log without a map."""
         return None if self.ground_truth is None else self.ground_truth.frame(self.pose(index), roi)
+
+    def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
+        """Return the ground truth of all frames, kept in the folder ``cache`` if one is given."""
+        if self.ground_truth is None:
+            return None
+        poses = [self.pose(index) for index in range(len(self))]
+        return all_truths(self.ground_truth, poses, roi, cache, "argoverse2")
 
     def truth_map(self) -> GlobalMap | None:
         """Return what a perfect mapper would have made of this log, or None for a log without a map."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.georeference import nuscenes_georeference
+from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
@@ -306,6 +307,13 @@ class NuScenesScene:
         if self.ground_truth is None:
             return None
         return self.ground_truth.frame(self.lidar_to_global(index), roi)
+
+    def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
+        """Return the ground truth of all frames, kept in the folder ``cache`` if one is given."""
+        if self.ground_truth is None:
+            return None
+        poses = [self.lidar_to_global(index) for index in range(len(self))]
+        return all_truths(self.ground_truth, poses, roi, cache, "nuscenes")
 
     def truth_map(self) -> GlobalMap | None:
         """Return what a perfect mapper would have made of this scene, or None without a map expansion."""

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import shapely
 from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
@@ -28,6 +27,7 @@ from predmapnet.datasets.ground_truth.lane_dividers import (
     without_shared,
     without_twins,
 )
+from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     area_rings,
@@ -54,6 +54,9 @@ class Argoverse2GroundTruth:
 
     What does not depend on the frame is done once: which lanes are valid, which boundaries repeat each other, and, for
     each set of lanes in view, the chained divider lines.
+
+    Attributes:
+        fingerprint: digest of the map that this was made from.
     """
 
     def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
@@ -65,7 +68,8 @@ class Argoverse2GroundTruth:
         Raises:
             UserError: the file is missing, damaged, or not a vector map.
         """
-        content, name = (map_file, "the map") if isinstance(map_file, Mapping) else (_read(map_file), str(map_file))
+        content, self.fingerprint = read_map(map_file)
+        name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
             lanes = list(content["lane_segments"].values())
             crossings = [
@@ -244,15 +248,3 @@ def _box(roi: RegionOfInterest, margin: float) -> Polygon:
 
 def _middle(line: Float, ego_to_global: Float) -> Float:
     return ego_to_global[:2, :2] @ midpoint(line[:, :2]) + ego_to_global[:2, 3]
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = orjson.loads(path.read_bytes())
-    except OSError as error:
-        raise UserError(f"Cannot read the map {path}: {error.strerror}.") from None
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{path} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path} is not an Argoverse 2 vector map: it must be one JSON object.")
-    return content

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -9,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import shapely
 from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.ground_truth.crossings import merge_crossings
+from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     apply,
@@ -46,6 +47,7 @@ class NuScenesGroundTruth:
         dividers: road dividers, then lane dividers, in file order (empty lines stay, for their index).
         crossings: pieces of pedestrian crossings in file order.
         road_segments, lanes: drivable surface in file order.
+        fingerprint: digest of the map that this was made from.
     """
 
     def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
@@ -57,7 +59,8 @@ class NuScenesGroundTruth:
         Raises:
             UserError: the file is missing, damaged, or not a map expansion.
         """
-        content, name = (map_file, "the map") if isinstance(map_file, Mapping) else (_read(map_file), str(map_file))
+        content, self.fingerprint = read_map(map_file)
+        name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
             nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
             lines = {line["token"]: line["node_tokens"] for line in content["line"]}
@@ -89,6 +92,10 @@ class NuScenesGroundTruth:
             road_segments=list(vector_map.road_segments),
             lanes=list(vector_map.lanes),
         )
+        layers = (truth.dividers, truth.crossings, truth.road_segments, truth.lanes)
+        truth.fingerprint = hashlib.sha256(
+            b"".join(shapely.to_wkb(shapely.geometrycollections(layer)) for layer in layers)
+        ).digest()
         return truth
 
     def _index(
@@ -240,18 +247,6 @@ class _Layer:
 def truth_from_vector_map(vector_map: VectorMap) -> NuScenesGroundTruth:
     """Ground truth of a map of the demo world, without files."""
     return NuScenesGroundTruth.from_vector_map(vector_map)
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    try:
-        content = orjson.loads(path.read_bytes())
-    except OSError as error:
-        raise UserError(f"Cannot read the map {path}: {error.strerror}.") from None
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{path} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
-    if not isinstance(content, dict):
-        raise UserError(f"{path} is not a nuScenes map expansion: it must be one JSON object.")
-    return content
 
 
 def _polygons(

@@ -1,0 +1,38 @@
+"""Read a map file and remember exactly which one it was."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from predmapnet.errors import UserError
+
+
+def read_map(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
+    """Read a map.
+
+    Args:
+        source: JSON file, or the content of one.
+
+    Returns:
+        Its content, and the SHA-256 digest of its bytes.
+
+    Raises:
+        UserError: the file is missing, damaged, or not one JSON object.
+    """
+    if isinstance(source, Mapping):
+        return source, hashlib.sha256(orjson.dumps(source)).digest()
+    try:
+        data = source.read_bytes()
+        content = orjson.loads(data)
+    except OSError as error:
+        raise UserError(f"Cannot read the map {source}: {error.strerror}.") from None
+    except orjson.JSONDecodeError as error:
+        raise UserError(f"{source} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{source} is not a map: it must be one JSON object.")
+    return content, hashlib.sha256(data).digest()

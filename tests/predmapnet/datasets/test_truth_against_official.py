@@ -1,0 +1,217 @@
+"""Every ground-truth polyline, in every form, against what the official code made of the same maps and poses.
+
+Case names are taken from the folders, so that other cases of the same layout are read as well.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import shapely
+
+from mapfusion.elements import RegionOfInterest
+from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
+from predmapnet.datasets.ground_truth.raster import semantic_mask
+from predmapnet.datasets.ground_truth.vectors import normalised, permuted, resampled, simplified
+from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.datasets.poses import pose_matrix
+
+pytestmark = pytest.mark.reference
+
+TOLERANCE = 1e-6
+SIZES = ("", "_100x50")
+
+
+def nuscenes_cases(folder):
+    """Yield (stored case, unstable items, frames as we form them, region, stem) of every nuScenes case."""
+    maps = sorted((folder / "maps" / "expansion").glob("*.json"))
+    for path in sorted((folder / "gt").glob("*.gt*.json")):
+        case = json.loads(path.read_text())
+        name = path.name.split(".")[0]
+        location = case["location"].split()[0]
+        truth = NuScenesGroundTruth(next((file for file in maps if file.stem == location), maps[0]))
+        roi = RegionOfInterest(*case["roi_size"])
+        frames = [truth.frame(lidar_to_global(frame), roi) for frame in case["frames"]]
+        listed = folder / "gt" / f"{name}.unstable_items.json"
+        unstable = json.loads(listed.read_text())["items"] if listed.exists() and path.name.endswith(".gt.json") else []
+        yield (
+            case,
+            {(item["index"], item["class_id"], item["item"]): item["kind"] for item in unstable},
+            frames,
+            roi,
+            name,
+        )
+
+
+def lidar_to_global(frame):
+    ego_to_global = pose_matrix(frame["e2g_rotation"], frame["e2g_translation"], "fixture")
+    return ego_to_global @ pose_matrix(frame["lidar2ego_rotation"], frame["lidar2ego_translation"], "fixture")
+
+
+def argoverse2_cases(folder):
+    source = Argoverse2Source(folder / "logs")
+    for path in sorted((folder / "gt").glob("*.gt*.json")):
+        case = json.loads(path.read_text())
+        scene = source.open(case["log_id"])
+        roi = RegionOfInterest(*case["roi_size"])
+        assert scene.timestamps.tolist() == [frame["timestamp_ns"] for frame in case["frames"]]
+        yield case, {}, [scene.truth(index, roi) for index in range(len(scene))], roi, case["log_id"]
+
+
+CASES = {"nuscenes": nuscenes_cases, "av2": argoverse2_cases}
+
+
+@pytest.fixture(params=CASES)
+def cases(request, reference):
+    found = list(CASES[request.param](reference("ground_truth", request.param)))
+    assert found
+    return found
+
+
+def pieces(truth, kind):
+    return [line for line, of in zip(truth.polylines, truth.kinds, strict=True) if of == kind]
+
+
+def difference(mine, official):
+    """Largest distance of corresponding vertices; rings may start anywhere."""
+    if len(mine) != len(official):
+        return np.inf
+    if np.linalg.norm(official[0] - official[-1]) > 1e-3:
+        return np.abs(mine - official).max()
+    mine, official = mine[:-1], official[:-1]
+    return min(np.abs(np.roll(mine, shift, axis=0) - official).max() for shift in range(len(mine)))
+
+
+def shape_difference(mine, official):
+    return shapely.hausdorff_distance(shapely.LineString(mine), shapely.LineString(official))
+
+
+def nearest(official, candidates):
+    return min(candidates, key=lambda line: shape_difference(line, official))
+
+
+def official_lines(frame, kind, form="raw"):
+    return [np.array(line)[:, :2] for line in frame[form][str(kind)]]
+
+
+def test_every_polyline(cases):
+    compared = 0
+    for case, unstable, frames, _, name in cases:
+        for stored, truth in zip(case["frames"], frames, strict=True):
+            for kind in range(3):
+                mine, official = pieces(truth, kind), official_lines(stored, kind)
+                where = f"{name}, frame {stored['index']}, class {kind}"
+                shaky = any(key[:2] == (stored["index"], kind) and what == "shape" for key, what in unstable.items())
+                assert len(mine) == len(official) or shaky, where
+                for item, line in enumerate(official):
+                    compared += 1
+                    if unstable.get((stored["index"], kind, item)) == "shape":
+                        continue
+                    other = nearest(line, mine)
+                    # Every ring may carry a redundant collinear vertex; what counts is its shape.
+                    ring = kind == 0 or np.allclose(line[0], line[-1], atol=1e-3)
+                    gap = shape_difference(other, line) if ring else difference(other, line)
+                    assert gap < TOLERANCE, f"{where}, item {item}: {gap} m off"
+    assert compared > 0
+
+
+def test_rings_are_the_same_vertices_in_the_same_direction(cases):
+    exact = total = 0
+    for case, _, frames, _, _ in cases:
+        for stored, truth in zip(case["frames"], frames, strict=True):
+            for line in official_lines(stored, 0):
+                candidates = pieces(truth, 0)
+                total += 1
+                exact += bool(candidates) and difference(nearest(line, candidates), line) < TOLERANCE
+    assert exact >= 0.95 * total, f"only {exact} of {total} crossings have the same vertices"
+
+
+def test_simplified_and_resampled_forms_of_the_official_lines(cases):
+    for case, _, _, _, _ in cases:
+        for frame in case["frames"]:
+            for kind in range(3):
+                for raw, short, even in zip(
+                    official_lines(frame, kind),
+                    official_lines(frame, kind, "eval_simplified"),
+                    official_lines(frame, kind, "vec20"),
+                    strict=True,
+                ):
+                    assert shape_difference(simplified(raw), short) < TOLERANCE
+                    assert len(simplified(raw)) == len(short)
+                    np.testing.assert_allclose(resampled(raw), even, atol=TOLERANCE)
+
+
+def test_permutations_of_the_official_lines(reference):
+    compared = 0
+    for data in ("nuscenes", "av2"):
+        folder = reference("ground_truth", data, "gt")
+        for path in sorted(folder.glob("*.permuted_norm.npz")):
+            case = json.loads((folder / path.name.replace("permuted_norm.npz", "gt.json")).read_text())
+            roi = RegionOfInterest(*case["roi_size"])
+            with np.load(path) as stored:
+                for key in stored.files:
+                    index, kind = (int(part) for part in key.removeprefix("frame").split("_class"))
+                    lines = official_lines(case["frames"][index], kind)
+                    mine = [permuted(normalised(resampled(line), roi)) for line in lines]
+                    np.testing.assert_allclose(np.array(mine).reshape(stored[key].shape), stored[key], atol=1e-9)
+                    compared += len(lines)
+    assert compared > 0
+
+
+def test_masks(reference):
+    compared = 0
+    for data, cases_of in CASES.items():
+        folder = reference("ground_truth", data)
+        for case, _, frames, roi, name in cases_of(folder):
+            suffix = "" if case["roi_size"] == [60, 30] else f"_{case['roi_size'][0]}x{case['roi_size'][1]}"
+            stored = np.load(folder / "gt" / f"{name}.raster{suffix}.npz")["semantic_mask"]
+            for frame, truth, official in zip(case["frames"], frames, stored, strict=True):
+                raw = [(kind, line) for kind in range(3) for line in official_lines(frame, kind)]
+                kinds = np.array([kind for kind, _ in raw], dtype=np.int64)
+                redrawn = semantic_mask(kinds, [line for _, line in raw], roi)
+                np.testing.assert_array_equal(redrawn, official)
+                # Ends of our own lines on the border may fall into the next pixel by the last bit.
+                own = semantic_mask(truth.kinds, truth.polylines, roi)
+                assert np.count_nonzero(own != official) <= 12
+                compared += 1
+    assert compared > 0
+
+
+def test_the_real_six_camera_sample(reference):
+    """Pose, projection and truth of a real sample as the official data set class returned them."""
+    folder = reference("ground_truth", "nuscenes_sample")
+    official = json.loads((folder / "get_sample.json").read_text())
+    scene = NuScenesSource(folder).open(official["scene_name"])
+    frame = scene.frame(official["sample_idx"])
+    assert frame.token == official["token"]
+    np.testing.assert_allclose(frame.ego_to_global[:3, 3], official["ego2global_translation"], atol=1e-9)
+    np.testing.assert_allclose(frame.ego_to_global[:3, :3], official["ego2global_rotation"], atol=1e-12)
+    for camera, filename, ego_to_camera, ego_to_image in zip(
+        frame.rig, official["img_filenames"], official["ego2cam"], official["ego2img"], strict=True
+    ):
+        assert frame.images[camera.name] == folder / filename
+        projection = np.eye(4)
+        projection[:3, :3] = camera.intrinsics
+        np.testing.assert_allclose(np.linalg.inv(camera.camera_to_ego), ego_to_camera, atol=1e-9)
+        np.testing.assert_allclose(projection @ np.linalg.inv(camera.camera_to_ego), ego_to_image, atol=1e-6)
+    truth = scene.truth(frame.index, RegionOfInterest())
+    for kind in range(3):
+        for line in (np.array(line) for line in official["map_geoms_raw"][str(kind)]):
+            assert shape_difference(nearest(line, pieces(truth, kind)), line) < TOLERANCE
+    mask = np.load(folder / "get_sample_raster.npz")
+    mask = mask[mask.files[0]]
+    assert np.count_nonzero(semantic_mask(truth.kinds, truth.polylines, RegionOfInterest()) != mask) <= 12
+
+
+def test_calibration_of_the_real_sample_against_its_source(reference):
+    folder = reference("ground_truth", "nuscenes_sample")
+    matrices = json.loads((folder / "pickle_matrices.json").read_text())
+    (info,) = NuScenesSource(folder).scenes()
+    scene = NuScenesSource(folder).open(info.name)
+    frame = scene.frame(0)
+    ego_to_global = np.array(matrices["ego2global"])
+    for camera in frame.rig:
+        stored = ego_to_global @ np.array(matrices[camera.name]["cam2ego"])
+        np.testing.assert_allclose(frame.ego_to_global @ camera.camera_to_ego, stored, atol=2e-4)
+        np.testing.assert_allclose(camera.intrinsics, np.array(matrices[camera.name]["cam2img"])[:3, :3], atol=1e-9)
