@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from predmapnet.demo_world.ground_texture import Pyramid
-from predmapnet.demo_world.jit import kernel
+from predmapnet.demo_world.jit import kernel, part
 from predmapnet.demo_world.looks import Light
 from predmapnet.demo_world.mesh import Mesh
 from predmapnet.demo_world.raster import Vector, View, ball_depth, face_plane, pixel_ray
@@ -46,7 +46,7 @@ class Surroundings(NamedTuple):
     sunlit: Float32
 
 
-@kernel
+@part
 def _lamp_light(around: Surroundings, x: float, y: float) -> float:
     column, row = int(np.floor(x - around.lamps_origin[0])), int(np.floor(y - around.lamps_origin[1]))
     rows, columns = around.lamps.shape
@@ -58,7 +58,7 @@ def _lamp_light(around: Surroundings, x: float, y: float) -> float:
     return float(top * (1 - v) + low * v)
 
 
-@kernel
+@part
 def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
     clear = np.exp(-light.haze * distance)
     return (
@@ -68,7 +68,7 @@ def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
     )
 
 
-@kernel
+@part
 def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient: float, facing: float) -> Colour:
     """Irradiance from the sun, the sky, headlights (``facing``: cosine towards the car) and lamps."""
     light = around.light
@@ -85,7 +85,7 @@ def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient
     )
 
 
-@kernel
+@part
 def _ground_colour(
     around: Surroundings, view: View, px: float, py: float, ray: Vector, dynamic: float, most: int
 ) -> Colour:
@@ -106,7 +106,7 @@ def _ground_colour(
     return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), distance)
 
 
-@kernel
+@part
 def _sky_mirror(
     around: Surroundings, ray: Vector, length: float, nx: float, ny: float, nz: float
 ) -> tuple[float, float, float, float]:
@@ -120,7 +120,7 @@ def _sky_mirror(
     return min(red, 2.0) * dim, min(green, 2.0) * dim, min(blue, 2.0) * dim, fresnel
 
 
-@kernel
+@part
 def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth: float, ray: Vector) -> Colour:
     light = around.light
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
@@ -167,7 +167,7 @@ def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth:
     return _hazy(light, colour, depth * length)
 
 
-@kernel
+@part
 def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth: float, ray: Vector) -> Colour:
     light, balls = around.light, mesh.balls
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])

@@ -17,6 +17,15 @@ if not os.access(Path(__file__).parent, os.W_OK) and not numba.config.CACHE_DIR:
     numba.config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"predmapnet-numba-{os.getuid()}")
 
 
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+}
+
+
 def kernel(function: Function) -> Function:
     """Compile ``function`` with numba; it releases the GIL, so threads render cameras side by side.
 
@@ -24,11 +33,9 @@ def kernel(function: Function) -> Function:
     allocate: without numba's reference counting, which would count every array of every argument of every call inside
     the loops over pixels, they run several times as fast. Scratch space comes from the caller.
     """
-    options = {
-        "cache": True,
-        "nogil": True,
-        "error_model": "numpy",
-        "_nrt": False,
-        "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-    }
-    return cast(Function, numba.njit(**options)(function))
+    return cast(Function, numba.njit(**_OPTIONS)(function))
+
+
+def part(function: Function) -> Function:
+    """Compile a part of kernels that is copied into its callers, whose many arguments are then not passed at all."""
+    return cast(Function, numba.njit(forceinline=True, **_OPTIONS)(function))

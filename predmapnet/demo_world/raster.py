@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from predmapnet.demo_world.jit import kernel
+from predmapnet.demo_world.jit import kernel, part
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -43,7 +43,7 @@ class View(NamedTuple):
     height: int
 
 
-@kernel
+@part
 def pixel_ray(view: View, x: float, y: float) -> Vector:
     """Direction through pixel position (x, y), global frame, its component along the optical axis being 1."""
     across, down = (x - view.centre_x) / view.focal_x, (y - view.centre_y) / view.focal_y
@@ -55,7 +55,7 @@ def pixel_ray(view: View, x: float, y: float) -> Vector:
     )
 
 
-@kernel
+@part
 def face_plane(corners: Float, normals: Float, face: int, view: View) -> Vector:
     """Coefficients of ``1 / depth = p0 * x + p1 * y + p2`` over a face, pixels."""
     rotation, position = view.rotation, view.position
@@ -104,7 +104,7 @@ def _project_clipped(corners: Float, count: int, view: View, scratch: Float) -> 
     return written
 
 
-@kernel
+@part
 def _span(screen: Float, count: int, y: float, columns: int) -> tuple[int, int]:
     """First column whose centre lies inside a convex outline at height ``y``, and the one past the last."""
     low, high = 1e30, -1e30
@@ -120,7 +120,7 @@ def _span(screen: Float, count: int, y: float, columns: int) -> tuple[int, int]:
     return first, min(columns, int(np.ceil(min(high, columns + 1.0) - 0.5)))
 
 
-@kernel
+@part
 def _rows_of(screen: Float, count: int, rows: int) -> tuple[int, int]:
     """First row whose centre lies inside an outline, and the one past the last."""
     top, bottom = 1e30, -1e30
@@ -172,7 +172,7 @@ def draw_faces(
                     ids[row, column] = face
 
 
-@kernel
+@part
 def _ball_space(balls: Float, index: int, x: float, y: float, z: float) -> Vector:
     """A vector of the global frame, in units of an ellipsoid's half axes."""
     cosine, sine = np.cos(balls[index, 6]), np.sin(balls[index, 6])
@@ -180,7 +180,7 @@ def _ball_space(balls: Float, index: int, x: float, y: float, z: float) -> Vecto
     return u, v, z / balls[index, 5]
 
 
-@kernel
+@part
 def ball_depth(balls: Float, index: int, view: View, x: float, y: float) -> float:
     """Depth along the optical axis where the ray of pixel position (x, y) meets an ellipsoid, or -1."""
     ray = pixel_ray(view, x, y)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from predmapnet.demo_world.ground_texture import Pyramid
-from predmapnet.demo_world.jit import kernel
+from predmapnet.demo_world.jit import part
 from predmapnet.demo_world.looks import Light
 from predmapnet.demo_world.raster import View
 
@@ -16,7 +16,7 @@ Colour = tuple[float, float, float]
 Texel = tuple[float, float, float, float]
 
 
-@kernel
+@part
 def smooth_noise(tile: Float32, x: float, y: float) -> float:
     """Read a noise tile between its texels (bilinear), periodically."""
     column, row = int(np.floor(x)), int(np.floor(y))
@@ -26,7 +26,7 @@ def smooth_noise(tile: Float32, x: float, y: float) -> float:
     return float(top * (1 - v) + low * v)
 
 
-@kernel
+@part
 def _read_level(pyramid: Pyramid, level: int, x: float, y: float) -> Texel:
     """Albedo (linear) and shadow at texel position (x, y) of level 0, read bilinearly from ``level``."""
     scale = 1.0 / (1 << level)
@@ -53,7 +53,7 @@ def _read_level(pyramid: Pyramid, level: int, x: float, y: float) -> Texel:
     return red * norm, green * norm, blue * norm, shade * np.float32(1 / 255.0)
 
 
-@kernel
+@part
 def _read_sharp(pyramid: Pyramid, x: float, y: float, sharpness: float) -> Texel:
     """As above at level 0, with the edges of paint as crisp as a pixel: coverage is a distance in disguise."""
     rows, columns = pyramid.rows[0], pyramid.columns[0]
@@ -84,7 +84,7 @@ def _read_sharp(pyramid: Pyramid, x: float, y: float, sharpness: float) -> Texel
     return red, green, blue, shade / 255.0
 
 
-@kernel
+@part
 def read_ground(
     fine: Pyramid, coarse: Pyramid, white: Float32, x: float, y: float, ux: float, uy: float, vx: float, vy: float,
     most: int,
@@ -152,7 +152,7 @@ def read_ground(
     return red / count, green / count, blue / count, shade / count
 
 
-@kernel
+@part
 def sky(light: Light, clouds: Float32, x: float, y: float, z: float) -> Colour:
     """Radiance of the sky in a direction (unit vector, global frame)."""
     height = max(z, 0.0)
@@ -176,7 +176,7 @@ def sky(light: Light, clouds: Float32, x: float, y: float, z: float) -> Colour:
     return red, green, blue
 
 
-@kernel
+@part
 def _window_share(position: float, pitch: float, open_share: float, blur: float) -> float:
     """Share of a window along one axis, filtered over ``blur`` metres."""
     phase = position / pitch
@@ -187,7 +187,7 @@ def _window_share(position: float, pitch: float, open_share: float, blur: float)
     return float(sharp + fade * (open_share - sharp))
 
 
-@kernel
+@part
 def _hash(a: int, b: int, c: int) -> float:
     """A number in [0, 1) that looks random."""
     value = (a * 73856093) ^ (b * 19349663) ^ (c * 83492791)
@@ -196,7 +196,7 @@ def _hash(a: int, b: int, c: int) -> float:
     return value / 65536.0
 
 
-@kernel
+@part
 def facade(
     light: Light, fractal: Float32, owner: int, along: float, height: float, blur: float, red: float, green: float,
     blue: float,
@@ -250,7 +250,7 @@ def facade(
     )  # fmt: skip
 
 
-@kernel
+@part
 def headlight(light: Light, view_car: Float, x: float, y: float, z: float) -> float:
     """Irradiance of the ego car's lamps at a point of the global frame; ``view_car`` is global to ego (4, 4)."""
     forward = view_car[0, 0] * x + view_car[0, 1] * y + view_car[0, 2] * z + view_car[0, 3] - 3.6
