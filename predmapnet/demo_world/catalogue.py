@@ -86,7 +86,7 @@ def look_of(name: str) -> Look:
     return list(LOOK_SHARES)[int(random.choice(len(LOOK_SHARES), p=list(LOOK_SHARES.values())))]
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def town_of(name: str) -> Town:
     """The town that a scene drives through."""
     return build_town(scene_number(name))

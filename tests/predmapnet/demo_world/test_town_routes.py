@@ -5,7 +5,7 @@ import shapely
 from predmapnet.demo_world.catalogue import scene_infos, town_of, trajectory
 
 NAMES = [info.name for split in ("test", "val") for info in scene_infos(split)] + [
-    info.name for info in scene_infos("train")[:20]
+    info.name for info in scene_infos("train")[:8]
 ]
 
 
