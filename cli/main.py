@@ -1,7 +1,7 @@
 """The command line: one file per command, and one place where errors become messages.
 
 Exit codes: 0 done, 1 some scenes of a batch failed, 2 a mistake or broken input (one message says which),
-130 stopped with Ctrl-C.
+3 a fault of PredMapNet itself, 130 stopped with Ctrl-C.
 """
 
 from __future__ import annotations
@@ -9,14 +9,16 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
 from cli.batch import batch
 from cli.console import say_error
+from cli.evaluate import evaluate
 from cli.infer import infer
 from cli.scenes import scenes
+from cli.train import train
 from cli.view import view
 from predmapnet.errors import UserError
 
@@ -33,6 +35,8 @@ app.command()(infer)
 app.command()(view)
 app.command()(batch)
 app.command()(scenes)
+app.command()(evaluate)
+app.command()(train)
 
 
 def _version(wanted: bool) -> None:
@@ -68,17 +72,20 @@ def main() -> None:
     except UserError as error:
         _fail(str(error), error)
     except OSError as error:
-        if error.errno not in DISK_IS_FULL:
-            raise
         where = f" ({error.filename})" if error.filename else ""
-        _fail(f"the disk is full{where}; make room and run the command again", error)
+        if error.errno in DISK_IS_FULL:
+            _fail(f"the disk is full{where}; make room and run the command again", error)
+        _fail(f"{(error.strerror or str(error)).lower()}{where}", error)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        _fail(f"this is a fault of PredMapNet ({reason}); predmapnet --debug ... shows where it comes from", error, 3)
 
 
-def _fail(message: str, error: Exception) -> None:
+def _fail(message: str, error: Exception, code: int = 2) -> NoReturn:
     if os.environ.get("PREDMAPNET_DEBUG"):
         raise error
     say_error(message)
-    sys.exit(2)
+    sys.exit(code)
 
 
 if __name__ == "__main__":
