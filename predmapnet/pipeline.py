@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import torch
 
 import predmapnet
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
@@ -30,6 +31,9 @@ from predmapnet.streaming import MapSnapshot, Observer, SceneRun, Step, map_scen
 
 FrameProgress = Callable[[int, int], None]
 """Called as ``progress(frames done, frames in all)``."""
+
+SEED = 0
+"""Of PyTorch's random numbers; the network draws none while it maps, so this only makes sure of it."""
 
 SYNTHETIC_NOTE = (
     "This is a map of the synthetic demo world: its roads do not exist, and its coordinates lie where no real road is."
@@ -139,6 +143,7 @@ class MappingPipeline:
         scene = self.source.open(scene_name, preparing)
         preparing_seconds = perf_counter() - start
         provenance = self.provenance(scene)
+        torch.manual_seed(SEED)
         georeference = scene.georeference
         if georeference is None:
             where = scene.info.location
@@ -174,6 +179,7 @@ class MappingPipeline:
             "synthetic": self.source.synthetic,
             "configuration": self.mapper.config.model_dump(mode="json"),
             "weights_sha256": self.mapper.weights_sha256,
+            "seed": SEED,
         }
         if self.source.synthetic:
             provenance["note"] = SYNTHETIC_NOTE

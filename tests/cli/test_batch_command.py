@@ -1,0 +1,104 @@
+"""``predmapnet batch``: many scenes, failures by name, and the same maps however often it was interrupted."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.cli.tiny_nuscenes import image_path, write_tiny_nuscenes
+
+SCENES = ("scene-0001", "scene-0002", "scene-0003", "scene-0004")
+
+
+@pytest.fixture
+def data(tmp_path) -> Path:
+    return write_tiny_nuscenes(tmp_path / "data", SCENES, frames=8)
+
+
+def settings(data: Path, weights: Path) -> list[str]:
+    return ["--data-root", str(data), "--weights", str(weights)]
+
+
+def without_time(path: Path) -> str:
+    return re.sub(r'"created":"[^"]*"', "", path.read_text())
+
+
+def log_lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def alive(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_after_sigkill_the_rest_is_mapped_and_the_maps_are_the_same(predmapnet, data, random_weights, tmp_path):
+    reference = tmp_path / "reference"
+    reference.mkdir()
+    for scene in SCENES:
+        command = ("infer", scene, "--out", reference / f"{scene}.geojson", "--threads", 1)
+        assert predmapnet(*command, *settings(data, random_weights)).code == 0
+
+    out = tmp_path / "maps"
+    arguments = ["batch", "--out", str(out), "--jobs", "2", *settings(data, random_weights)]
+    command = [sys.executable, "-m", "cli.main", *arguments]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True) as process:
+        deadline = time.monotonic() + 300
+        while not list(out.glob("*.summary.json")) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    done_before = {path.name.split(".")[0] for path in out.glob("*.summary.json")}
+    while alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(process.pid), "workers should end when their parent is gone"
+
+    result = predmapnet(*arguments)
+    assert result.code == 0, result.err
+    summary = json.loads((out / "summary.json").read_text())
+    status = {scene["scene"]: scene["status"] for scene in summary["scenes"]}
+    assert set(status) == set(SCENES)
+    assert done_before <= {scene for scene, how in status.items() if how == "done before"}
+    for scene in SCENES:
+        assert without_time(out / f"{scene}.geojson") == without_time(reference / f"{scene}.geojson")
+    assert not [path for path in out.iterdir() if path.name.endswith(".part")]
+
+
+def test_a_failed_scene_is_listed_with_its_reason_and_tried_again(predmapnet, data, random_weights, tmp_path):
+    broken = image_path(data, "scene-0002", 1, "CAM_FRONT")
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:1000])
+    arguments = ["batch", "scene-0001", "scene-0002", "--out", "maps", *settings(data, random_weights)]
+    first = predmapnet(*arguments)
+    assert first.code == 1
+    assert "scene-0002" in first.err
+    assert "cut short" in first.err
+    assert "1 of 2 scenes are done" in first.out
+    out = tmp_path / "maps"
+    assert sorted(path.name for path in out.glob("*.geojson")) == ["scene-0001.geojson"]
+    assert {line["scene"]: line["status"] for line in log_lines(out)} == {"scene-0001": "done", "scene-0002": "failed"}
+
+    broken.write_bytes(whole)
+    second = predmapnet(*arguments)
+    assert second.code == 0
+    assert [line["status"] for line in log_lines(out)][2:] == ["done before", "done"]
+
+
+def test_wrong_scenes_and_folders_are_told_before_the_work(predmapnet, data, random_weights, tmp_path):
+    unknown = predmapnet("batch", "scene-0009", "--out", "maps", *settings(data, random_weights))
+    assert unknown.code == 2
+    assert "scene-000" in unknown.err
+    (tmp_path / "file").write_text("")
+    blocked = predmapnet("batch", "--out", "file/maps", *settings(data, random_weights))
+    assert blocked.code == 2
+    assert "cannot make the folder" in blocked.err
+    empty = predmapnet("batch", "--split", "train", "--out", "maps", *settings(data, random_weights))
+    assert empty.code == 2
