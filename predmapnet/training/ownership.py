@@ -143,9 +143,10 @@ def _choose_of_stream(
     continuing = [row for row in np.flatnonzero(confident[:track_rows]) if generator.random() >= settings.track_dropout]
     source = {int(row): int(row) for row in continuing}
     keeper: dict[int, int] = {}
-    for row in continuing:
-        if truth[row] >= 0 and scores[row] > scores[keeper.get(truth[row], row)] - 1e-9:
-            keeper[truth[row]] = int(row)
+    for row in source:
+        owned = int(truth[row])
+        if owned >= 0 and (owned not in keeper or scores[row] > scores[keeper[owned]]):
+            keeper[owned] = row
     newborn: list[int] = []
     false: list[int] = []
     for row in track_rows + np.flatnonzero(confident[track_rows:]):

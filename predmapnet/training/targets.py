@@ -91,7 +91,7 @@ def truth_targets(
     if grid:
         for index, line in enumerate(lines):
             draw_element(masks[index], line, ElementKind(kinds[index]), roi)
-            np.maximum(segmentation[frame[index], kinds[index]], masks[index], segmentation[frame[index], kinds[index]])
+            segmentation[frame[index], kinds[index]] |= masks[index]
     return Targets(
         batch=len(truths),
         frame=torch.tensor(frame, dtype=torch.int64),
