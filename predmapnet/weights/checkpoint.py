@@ -1,7 +1,7 @@
 """Checkpoints as safetensors files: the network's weights, its configuration, and how it was trained.
 
-Nothing is ever unpickled. The metadata of a file holds ``format``, ``version`` (of the package), ``configuration`` and
-``facts`` (free JSON: data, frames seen, scores).
+Nothing is ever unpickled. The metadata of a file has one key, ``predmapnet`` (several would be written in random order),
+with JSON: ``format``, ``version`` (of the package), ``configuration`` and ``facts`` (data, frames seen, scores).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from predmapnet.network.predmapnet import PredMapNet
 SHIPPED = Path(__file__).with_name("lite.safetensors")
 """The weights that come with the package."""
 
-FORMAT = "predmapnet-1"
+KEY = "predmapnet"
+FORMAT = 1
 _SHOWN_NAMES = 4
 
 
@@ -63,12 +64,13 @@ def save_checkpoint(
     for name, tensor in network.state_dict().items():
         stored = tensor.half() if half and tensor.is_floating_point() else tensor
         tensors[name] = stored.detach().cpu().contiguous()
-    metadata = {
+    about = {
         "format": FORMAT,
         "version": __version__,
-        "configuration": network.config.to_json(),
-        "facts": json.dumps(dict(facts or {})),
+        "configuration": network.config.model_dump(mode="json"),
+        "facts": dict(facts or {}),
     }
+    metadata = {KEY: json.dumps(about)}
     with write_whole(path) as temporary:
         temporary.write_bytes(save(tensors, metadata))
 
@@ -85,20 +87,20 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     path = _existing(path)
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
+            about = json.loads((file.metadata() or {}).get(KEY, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise UserError(f"{path} is not a whole safetensors file ({error}). Fetch or write it again.") from None
-    if metadata.get("format") != FORMAT:
+    if about.get("format") != FORMAT:
         raise UserError(
-            f"{path} does not hold PredMapNet weights (its metadata has no format '{FORMAT}'). "
+            f"{path} does not hold PredMapNet weights of format {FORMAT} (it says: {about.get('format')}). "
             "Weights of other programs have to be imported first."
         )
-    network = PredMapNet(parse_config(metadata["configuration"], str(path)))
+    network = PredMapNet(parse_config(json.dumps(about["configuration"]), str(path)))
     _check_fit({name: tensor.shape for name, tensor in tensors.items()}, network, path)
     network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
     network.eval()
-    return Checkpoint(network, json.loads(metadata["facts"]), metadata["version"], weights_hash(path))
+    return Checkpoint(network, about["facts"], about["version"], weights_hash(path))
 
 
 def weights_hash(path: Path | None = None) -> str:

@@ -1,0 +1,62 @@
+"""A network small enough for tests, and streams of random frames."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.interface import FrameInputs
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.view_transform import RigLookup
+
+SMALL = {
+    "image": {"width": 64, "height": 24},
+    "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
+    "bev": {"rows": 26, "columns": 52, "widths": (16, 24, 32)},
+    "temporal_bev": {"channels": 4, "capacity": 5},
+    "masks": {"channels": 16},
+    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
+    "future": {"hidden": 32},
+}
+
+
+@pytest.fixture
+def make_network() -> Callable[..., PredMapNet]:
+    """Return a maker of small networks in evaluation mode; keyword arguments change sections of the configuration."""
+
+    def make(seed: int = 0, **sections: dict[str, object]) -> PredMapNet:
+        values = {name: {**SMALL.get(name, {}), **sections.get(name, {})} for name in {*SMALL, *sections}}
+        torch.manual_seed(seed)
+        return PredMapNet(PredMapNetConfig.model_validate(values)).eval()
+
+    return make
+
+
+@pytest.fixture
+def network(make_network: Callable[..., PredMapNet]) -> PredMapNet:
+    return make_network()
+
+
+@pytest.fixture
+def lookup(network: PredMapNet) -> RigLookup:
+    return network.make_rig_lookup(DEMO_RIG)
+
+
+@pytest.fixture
+def make_inputs(network: PredMapNet) -> Callable[..., FrameInputs]:
+    """Return a maker of random frames; ``x`` moves the car forward, metres."""
+
+    def make(batch: int = 1, seed: int = 0, x: float = 0.0) -> FrameInputs:
+        generator = torch.Generator().manual_seed(seed)
+        image = network.config.image
+        pose = torch.eye(4, dtype=torch.float64).repeat(batch, 1, 1)
+        pose[:, 0, 3] = 1000.0 + x
+        return FrameInputs(
+            images=torch.randn(batch, len(DEMO_RIG), 3, image.height, image.width, generator=generator),
+            camera_valid=torch.ones(batch, len(DEMO_RIG), dtype=torch.bool),
+            ego_to_global=pose,
+        )
+
+    return make

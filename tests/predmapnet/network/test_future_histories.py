@@ -1,0 +1,55 @@
+"""Short-Term Future Guidance: histories and forecasts (Sec. 3.5)."""
+
+import torch
+
+from predmapnet.network.future_guidance import extend_history
+
+NEW = torch.tensor([[False]])
+OLD = torch.tensor([[True]])
+ROW = torch.zeros(1, 1, dtype=torch.long)
+
+
+def line(x):
+    return torch.stack([torch.linspace(x, x + 0.2, 6), torch.full((6,), 0.5)], dim=-1)[None, None]
+
+
+def grown(count):
+    history, valid = torch.zeros(1, 0, 4, 6, 2), torch.zeros(1, 0, 4).bool()
+    for number in range(count):
+        history, valid = extend_history(history, valid, line(0.5 - 0.05 * number), ROW, OLD if number else NEW)
+    return history, valid
+
+
+def test_a_short_history_is_padded_by_its_oldest_polyline_and_masked():
+    history, valid = grown(2)
+    assert valid.tolist() == [[[False, False, True, True]]]
+    torch.testing.assert_close(history[0, 0, :3], line(0.5)[0].expand(3, -1, -1))
+    torch.testing.assert_close(history[0, 0, 3], line(0.45)[0, 0])
+
+
+def test_a_long_history_keeps_the_last_ones_oldest_first():
+    history, valid = grown(6)
+    assert valid.all()
+    torch.testing.assert_close(history[0, 0], torch.cat([line(0.5 - 0.05 * n)[0] for n in (2, 3, 4, 5)]))
+
+
+def test_a_line_that_turns_round_turns_its_past_with_it():
+    history, valid = grown(3)
+    turned, _ = extend_history(history, valid, line(0.35).flip(2), ROW, OLD)
+    torch.testing.assert_close(turned, grown(4)[0].flip(3))
+
+
+def test_an_untrained_forecast_is_the_last_polyline(network):
+    history, valid = grown(3)
+    assert torch.equal(network.future_guidance.forecast(history, valid), history[:, :, -1])
+
+
+def test_padding_of_a_history_does_not_change_its_forecast(make_network):
+    guidance = make_network().future_guidance
+    torch.nn.init.normal_(guidance.offsets[-1].weight)
+    history, valid = grown(2)
+    other = history.clone()
+    other[:, :, :2] += 0.3
+    torch.testing.assert_close(guidance.forecast(history, valid), guidance.forecast(other, valid))
+    other[:, :, 2] += 0.3
+    assert (guidance.forecast(history, valid) - guidance.forecast(other, valid)).abs().max() > 1e-4

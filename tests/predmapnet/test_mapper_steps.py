@@ -1,0 +1,156 @@
+"""The mapper on frames with image files: streams in turns, missing cameras, reports."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.datasets.source import Frame
+from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.errors import UserError
+from predmapnet.mapper import Mapper
+from predmapnet.network.interface import StreamState
+from predmapnet.network.predmapnet import PredMapNet
+
+SMALL = {
+    "image": {"width": 64, "height": 24},
+    "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
+    "bev": {"rows": 26, "columns": 52, "widths": (16, 24, 32)},
+    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
+    "tracking": {"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02},
+}
+
+
+@pytest.fixture(scope="module")
+def mapper():
+    torch.manual_seed(0)
+    network = PredMapNet(PredMapNetConfig.model_validate(SMALL))
+    for parameter in network.parameters():
+        if parameter.abs().max() == 0:
+            torch.nn.init.normal_(parameter, std=0.1)
+    for layer in network.map_decoder.layers:
+        torch.nn.init.normal_(layer.classify.weight, std=0.2)
+    return Mapper(network)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Two logs of four frames."""
+    folder = tmp_path_factory.mktemp("logs")
+    return {name: [make_frame(folder, name, index, seed) for index in range(4)] for seed, name in enumerate("ab")}
+
+
+def make_frame(folder, scene, index, seed):
+    generator = np.random.default_rng([seed, index])
+    images = {}
+    for camera in DEMO_RIG:
+        images[camera.name] = folder / f"{scene}-{index}-{camera.name}.png"
+        small = generator.integers(0, 255, (9, 16, 3), dtype=np.uint8)
+        cv2.imwrite(str(images[camera.name]), cv2.resize(small, (camera.width, camera.height)))
+    pose = np.eye(4)
+    pose[0, 3] = 500.0 + 2.0 * index
+    return Frame(scene, index, f"{scene}{index}", 10**9 * index, pose, DEMO_RIG, images)
+
+
+def same(one, other):
+    assert one.track_ids.tolist() == other.track_ids.tolist()
+    np.testing.assert_array_equal(one.scores, other.scores)
+    np.testing.assert_array_equal(np.array(one.polylines), np.array(other.polylines))
+    np.testing.assert_array_equal(one.history_masks, other.history_masks)
+
+
+def run(mapper, frames):
+    state, maps = None, []
+    for frame in frames:
+        frame_map, state = mapper.step(frame, state)
+        maps.append(frame_map)
+    return maps
+
+
+def test_two_logs_in_turns_give_the_same_as_one_after_the_other(mapper, logs):
+    apart = {name: run(mapper, frames) for name, frames in logs.items()}
+    states = dict.fromkeys(logs)
+    for index in range(4):
+        for name, frames in logs.items():
+            frame_map, states[name] = mapper.step(frames[index], states[name])
+            same(frame_map, apart[name][index])
+    assert len(apart["a"][-1].tracked) > 0
+
+
+def test_a_saved_state_goes_on_as_if_nothing_had_happened(mapper, logs):
+    maps = run(mapper, logs["a"])
+    _, state = mapper.step(logs["a"][0], None)
+    restored = StreamState.from_tensors({name: tensor.clone() for name, tensor in state.tensors().items()})
+    same(mapper.step(logs["a"][1], restored)[0], maps[1])
+
+
+def test_a_frame_map_holds_what_it_promises(mapper, logs):
+    for frame, frame_map in zip(logs["a"], run(mapper, logs["a"]), strict=True):
+        assert frame_map.timestamp == frame.timestamp
+        assert (frame_map.scores >= 0).all() and (frame_map.scores <= 1).all()
+        tracked = frame_map.track_ids >= 0
+        assert len(set(frame_map.track_ids[tracked])) == tracked.sum()
+        for kind, line, forecast, ours in zip(
+            frame_map.kinds, frame_map.polylines, frame_map.forecasts, tracked, strict=True
+        ):
+            assert line.shape == (6, 2) and line.dtype == np.float64
+            assert (np.abs(line) <= frame_map.roi.size / 2).all()
+            assert len(forecast) == (6 if ours else 0)
+            if kind == 0:
+                np.testing.assert_array_equal(line[0], line[-1])
+        assert frame_map.segmentation.shape == (3, 52, 104) and frame_map.segmentation.dtype == np.float32
+        assert frame_map.history_masks.shape == (len(frame_map), 13, 26)
+
+
+def test_a_missing_camera_is_an_error_that_says_which_and_what_to_do(mapper, logs):
+    frame = logs["a"][2]
+    gone = frame.images["CAM_BACK"].with_name("gone.jpg")
+    with pytest.raises(UserError) as caught:
+        mapper.step(replace(frame, images={**frame.images, "CAM_BACK": gone}))
+    for words in ("Frame 2 of a", "CAM_BACK", str(gone), "--allow-missing-cameras"):
+        assert words in str(caught.value)
+    absent = {name: path for name, path in frame.images.items() if name != "CAM_FRONT"}
+    with pytest.raises(UserError, match="CAM_FRONT: the data set names no file"):
+        mapper.step(replace(frame, images=absent))
+
+
+def test_a_camera_that_may_be_missing_is_masked(mapper, logs):
+    frame = logs["a"][0]
+    absent = {name: path for name, path in frame.images.items() if name != "CAM_BACK"}
+    images = mapper.read_images(replace(frame, images=absent), allow_missing_cameras=True)
+    assert images.valid.tolist() == [True, True, True, False, True, True]
+    seen, _ = mapper.step(frame)
+    masked, _ = mapper.step(replace(frame, images=absent), allow_missing_cameras=True)
+    assert np.abs(seen.segmentation - masked.segmentation).max() > 1e-4
+    with pytest.raises(UserError, match="no image of any camera"):
+        mapper.read_images(replace(frame, images={}), allow_missing_cameras=True)
+
+
+def test_an_image_of_another_size_is_refused(mapper, logs, tmp_path):
+    path = tmp_path / "small.png"
+    cv2.imwrite(str(path), np.zeros((90, 160, 3), np.uint8))
+    frame = logs["a"][0]
+    with pytest.raises(UserError, match=r"small\.png has 160 x 90 pixels.* 800 x 450"):
+        mapper.step(replace(frame, images={**frame.images, "CAM_FRONT": path}))
+
+
+def test_a_rig_that_wobbles_by_rounding_keeps_its_lookup_and_another_gets_its_own(mapper, logs):
+    def shifted(metres):
+        pose = DEMO_RIG[0].camera_to_ego.copy()
+        pose[0, 3] += metres
+        return (replace(DEMO_RIG[0], camera_to_ego=pose), *DEMO_RIG[1:])
+
+    first = mapper._lookup(DEMO_RIG)
+    assert mapper._lookup(shifted(5e-5)) is first
+    assert mapper._lookup(shifted(0.05)) is not first
+    assert mapper._lookup(DEMO_RIG) is first
+
+
+def test_an_unknown_device_is_refused():
+    from predmapnet.mapper import choose_device
+
+    with pytest.raises(UserError, match="device 'toaster' cannot be used"):
+        choose_device("toaster")
