@@ -8,7 +8,7 @@ from pathlib import Path
 from predmapnet.datasets.georeference import demo_georeference
 from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
 from predmapnet.datasets.source import Progress, SceneInfo
-from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos
+from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos, scene_number
 from predmapnet.errors import UserError
 
 
@@ -41,14 +41,13 @@ class DemoSource:
             UserError: a scene that does not exist, or a cache folder that cannot be written to.
         """
         folder = ensure_scene(scene, self.root, progress)
-        infos = scene_infos()
-        number = next(number for number, info in enumerate(infos) if info.name == scene)
+        (info,) = (info for info in scene_infos() if info.name == scene)
         written = NuScenesSource(folder).open(scene)
-        if len(written) != infos[number].frames:
+        if len(written) != info.frames:
             raise UserError(
-                f"{folder} holds {len(written)} frames of {scene} instead of {infos[number].frames}. "
+                f"{folder} holds {len(written)} frames of {scene} instead of {info.frames}. "
                 "The rendering is incomplete: delete this folder and it will be made again."
             )
-        written.info = dataclasses.replace(infos[number], ready=True)
-        written.georeference = demo_georeference(infos[number].location, number)
+        written.info = dataclasses.replace(info, ready=True)
+        written.georeference = demo_georeference(info.location, scene_number(scene))
         return written

@@ -91,7 +91,7 @@ def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tupl
             cv2.polylines(mask, [line.astype(np.int32)], False, 1, thickness=THICKNESS, lineType=cv2.LINE_8)
         if cv2.countNonZero(mask) < SMALL_MASK:
             mask[:] = cv2.dilate(mask, _SMALL_MASK_KERNEL, iterations=1)
-    return masks.reshape(len(points), -1)
+    return masks.reshape(len(points), canvas[0] * canvas[1])
 
 
 def mask_iou(first: Mask, second: Mask) -> Float:

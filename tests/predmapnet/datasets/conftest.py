@@ -12,7 +12,7 @@ PROJECT = Path(__file__).resolve().parents[3]
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def reference():
     """A function that gives a path in the reference folder, and skips the test where it is absent."""
 

@@ -1,0 +1,156 @@
+"""The Argoverse 2 reader, on a log made from nothing."""
+
+import json
+
+import cv2
+import numpy as np
+import pyarrow
+import pytest
+from pyarrow import feather
+
+from mapfusion.elements import RegionOfInterest
+from predmapnet.datasets.argoverse2 import CAMERAS, Argoverse2Source
+from predmapnet.errors import UserError
+
+SWEEP = 100_000_000
+START = 315_966_000_000_000_000
+
+
+def point(x, y):
+    return {"x": x, "y": y, "z": 10.0}
+
+
+def lane(number, low, high, **neighbours):
+    return {
+        "id": number,
+        "is_intersection": False,
+        "lane_type": "VEHICLE",
+        "left_lane_boundary": [point(0, high), point(200, high)],
+        "right_lane_boundary": [point(0, low), point(200, low)],
+        "left_lane_mark_type": "NONE",
+        "right_lane_mark_type": "NONE",
+        "successors": [],
+        "predecessors": [],
+        "left_neighbor_id": neighbours.get("left"),
+        "right_neighbor_id": neighbours.get("right"),
+    }
+
+
+def write_log(folder, sweeps=9):
+    """A car that stands at x = 50 of a straight road of two lanes, each 4 m wide."""
+    times = [START + SWEEP * number for number in range(sweeps)]
+    folder.mkdir(parents=True)
+    ones, zeros = np.ones(sweeps), np.zeros(sweeps)
+    poses = {"timestamp_ns": times, "qw": ones, "qx": zeros, "qy": zeros, "qz": zeros}
+    poses |= {"tx_m": 50 * ones, "ty_m": 4 * ones, "tz_m": 10 * ones}
+    feather.write_feather(pyarrow.table(poses), folder / "city_SE3_egovehicle.feather")
+    (folder / "calibration").mkdir()
+    count = len(CAMERAS)
+    intrinsics = {"sensor_name": CAMERAS, "fx_px": [10.0] * count, "fy_px": [11.0] * count, "cx_px": [8.0] * count}
+    intrinsics |= {"cy_px": [4.0] * count, "height_px": [9] * count, "width_px": [16] * count}
+    feather.write_feather(pyarrow.table(intrinsics), folder / "calibration" / "intrinsics.feather")
+    mounting = {"sensor_name": CAMERAS, "qw": [1.0] * count, "qx": [0.0] * count, "qy": [0.0] * count}
+    mounting |= {"qz": [0.0] * count, "tx_m": [1.5] * count, "ty_m": [0.0] * count, "tz_m": [1.4] * count}
+    feather.write_feather(pyarrow.table(mounting), folder / "calibration" / "egovehicle_SE3_sensor.feather")
+    (folder / "sensors" / "lidar").mkdir(parents=True)
+    for time in times:
+        (folder / "sensors" / "lidar" / f"{time}.feather").touch()
+        for camera in CAMERAS:
+            image = folder / "sensors" / "cameras" / camera / f"{time + 20_000_000}.jpg"
+            image.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(image), np.zeros((9, 16, 3), dtype=np.uint8))
+    content = {
+        "lane_segments": {"1": lane(1, 0, 4, left=2), "2": lane(2, 4, 8, right=1)},
+        "pedestrian_crossings": {
+            "7": {"id": 7, "edge1": [point(60, 0), point(60, 8)], "edge2": [point(63, 0), point(63, 8)]}
+        },
+        "drivable_areas": {"9": {"id": 9, "area_boundary": [point(0, 0), point(200, 0), point(200, 8), point(0, 8)]}},
+    }
+    (folder / "map").mkdir()
+    (folder / "map" / f"log_map_archive_{folder.name}____MIA_city_1.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def log(tmp_path):
+    return write_log(tmp_path / "data" / "val" / "0aaa-log")
+
+
+def test_key_frames_are_every_fourth_sweep_with_the_nearest_images(log):
+    source = Argoverse2Source(log.parents[1])
+    (info,) = source.scenes()
+    assert (info.name, info.split, info.frames, info.location, info.ready) == ("0aaa-log", "val", 3, "MIA", True)
+    scene = source.open("0aaa-log")
+    frame = scene.frame(1)
+    assert frame.timestamp == START + 4 * SWEEP
+    assert frame.token == f"0aaa-log_{START + 4 * SWEEP}"
+    assert {path.stem for path in frame.images.values()} == {str(START + 4 * SWEEP + 20_000_000)}
+    assert tuple(camera.name for camera in frame.rig) == CAMERAS
+    np.testing.assert_allclose(frame.rig[0].intrinsics, [[10, 0, 8], [0, 11, 4], [0, 0, 1]])
+    np.testing.assert_allclose(frame.rig[0].camera_to_ego[:3, 3], [1.5, 0, 1.4])
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_a_root_may_be_a_log_or_hold_logs(log, depth):
+    root = [log, *log.parents][depth]
+    assert [info.name for info in Argoverse2Source(root).scenes()] == ["0aaa-log"]
+
+
+def test_without_lidar_the_front_camera_gives_the_frames(log):
+    for sweep in (log / "sensors" / "lidar").iterdir():
+        sweep.unlink()
+    scene = Argoverse2Source(log).open("0aaa-log")
+    assert scene.timestamps.tolist() == [START + 20_000_000, START + 8 * SWEEP + 20_000_000]
+
+
+def test_an_image_more_than_25_ms_away_does_not_count(log):
+    folder = log / "sensors" / "cameras" / CAMERAS[3]
+    (folder / f"{START + 20_000_000}.jpg").rename(folder / f"{START + 26_000_000}.jpg")
+    frame = Argoverse2Source(log).open("0aaa-log").frame(0)
+    assert CAMERAS[3] not in frame.images
+    assert len(frame.images) == 6
+
+
+def test_truth_of_a_straight_road(log):
+    truth = Argoverse2Source(log).open("0aaa-log").truth(0, RegionOfInterest())
+    assert truth.kinds.tolist() == [0, 1, 2, 2]
+    np.testing.assert_allclose(np.ptp(truth.polylines[0], axis=0), [3, 8], atol=1e-9)
+    np.testing.assert_allclose(truth.polylines[1], [[-30, 0], [30, 0]], atol=1e-9)
+    assert truth.element_ids.tolist()[:2] == [0, 0]
+
+
+def test_a_log_without_images_or_calibration_still_serves_truth(log):
+    (log / "sensors" / "cameras").rename(log / "elsewhere")
+    scene = Argoverse2Source(log).open("0aaa-log")
+    assert scene.truth(0, RegionOfInterest()) is not None
+    assert len(scene.truth_map()) == 4
+    with pytest.raises(UserError, match=r"has no images .*cannot be mapped"):
+        scene.frame(0)
+    (log / "elsewhere").rename(log / "sensors" / "cameras")
+    (log / "calibration").rename(log / "elsewhere")
+    with pytest.raises(UserError, match="no calibration folder"):
+        Argoverse2Source(log).open("0aaa-log").frame(0)
+
+
+def test_a_pose_that_is_not_finite_names_the_row(log):
+    path = log / "city_SE3_egovehicle.feather"
+    table = feather.read_table(path).to_pydict()
+    table["tx_m"][4] = float("nan")
+    feather.write_feather(pyarrow.table(table), path)
+    scene = Argoverse2Source(log).open("0aaa-log")
+    scene.frame(0)
+    with pytest.raises(UserError, match=r"0aaa-log, frame 1, .*egovehicle\.feather, row 4: .*nan"):
+        scene.frame(1)
+
+
+def test_damaged_files_and_wrong_names_are_named(log):
+    with pytest.raises(UserError, match=r"no log '0bbb-log'.*Did you mean 0aaa-log"):
+        Argoverse2Source(log).open("0bbb-log")
+    (log / "city_SE3_egovehicle.feather").write_bytes(b"ARROW1 but cut")
+    with pytest.raises(UserError, match=r"egovehicle\.feather is not a readable feather file"):
+        Argoverse2Source(log).open("0aaa-log")
+
+
+def test_a_folder_without_logs(tmp_path):
+    with pytest.raises(UserError, match="holds no Argoverse 2 sensor logs"):
+        Argoverse2Source(tmp_path)

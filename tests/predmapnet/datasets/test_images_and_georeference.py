@@ -1,0 +1,83 @@
+"""Damaged images are noticed; metres become the right longitude and latitude."""
+
+import cv2
+import numpy as np
+import pytest
+from pyproj import Geod, Transformer
+
+from predmapnet.datasets.georeference import (
+    NUSCENES_ORIGINS,
+    argoverse2_georeference,
+    demo_georeference,
+    nuscenes_georeference,
+)
+from predmapnet.datasets.images import read_image
+from predmapnet.errors import UserError
+
+
+@pytest.fixture
+def photograph(tmp_path):
+    image = np.zeros((90, 160, 3), dtype=np.uint8)
+    image[:, :, 2] = np.arange(160)
+    image[:, :, 1] = np.arange(90)[:, None]
+    path = tmp_path / "image.jpg"
+    cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    return path
+
+
+def test_images_are_rgb(photograph):
+    image = read_image(photograph)
+    assert (image.shape, image.dtype) == ((90, 160, 3), np.uint8)
+    assert image[45, 150, 0] > 130 > 20 > image[45, 150, 2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
+def test_a_truncated_jpeg_is_named(photograph, share):
+    data = photograph.read_bytes()
+    photograph.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(UserError, match=str(photograph)):
+        read_image(photograph)
+
+
+def test_what_is_no_image_is_named(tmp_path):
+    path = tmp_path / "image.jpg"
+    with pytest.raises(UserError, match="Cannot read the image"):
+        read_image(path)
+    path.write_text("not found")
+    with pytest.raises(UserError, match="not an image that can be decoded"):
+        read_image(path)
+
+
+@pytest.mark.parametrize("location", NUSCENES_ORIGINS)
+def test_nuscenes_maps_lie_at_bearing_and_distance_on_the_devkits_sphere(location):
+    points = np.array([[0.0, 0.0], [1500.0, 900.0], [300.0, 2000.0]])
+    latitude, longitude = NUSCENES_ORIGINS[location]
+    sphere = f"+proj=aeqd +lat_0={latitude} +lon_0={longitude} +R=6378137"
+    expected = Transformer.from_crs(sphere, "+proj=longlat +R=6378137", always_xy=True).transform(*points.T)
+    result = nuscenes_georeference(location).to_wgs84(points)
+    np.testing.assert_allclose(result, np.stack(expected, axis=1), atol=1e-10)
+
+
+@pytest.mark.parametrize("city", ["ATX", "DTW", "MIA", "PAO", "PIT", "WDC"])
+def test_argoverse2_distances_are_true_to_the_scale_of_utm(city):
+    georeference = argoverse2_georeference(city)
+    (lon_a, lat_a), (lon_b, lat_b) = georeference.to_wgs84(np.array([[0.0, 0.0], [3000.0, 4000.0]]))
+    _, _, distance = Geod(ellps="WGS84").inv(lon_a, lat_a, lon_b, lat_b)
+    assert (lat_a, lon_a) == pytest.approx((georeference.latitude, georeference.longitude), abs=1e-9)
+    assert distance == pytest.approx(5000.0, rel=6e-4)
+
+
+def test_unknown_places_have_no_georeference():
+    assert nuscenes_georeference("atlantis") is None
+    assert argoverse2_georeference("XYZ") is None
+
+
+def test_demo_towns_lie_in_the_open_ocean_and_never_overlap():
+    corners = np.array([[-1000.0, -1000.0], [1000.0, 1000.0]])
+    boxes = np.array([demo_georeference(f"town-{n}", n).to_wgs84(corners) for n in range(420)])
+    low, high = boxes[:, 0], boxes[:, 1]
+    overlap = (low[:, None] < high[None]).all(axis=2) & (low[None] < high[:, None]).all(axis=2)
+    assert np.count_nonzero(overlap) == 420, "each town overlaps only itself"
+    # The nearest land of Point Nemo is 2,688 km away.
+    distances = Geod(ellps="WGS84").inv(*np.broadcast_arrays(-123.3933, -48.8767, *boxes[:, 0].T))[2]
+    assert max(distances) < 400_000
