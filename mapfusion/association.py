@@ -17,8 +17,8 @@ from mapfusion.observations import Observation
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
 
-TRACK_BONUS = 0.5
-"""A track that was fused into an element before counts as if it lay closer by this share of the match distance."""
+TRACK_BONUS = 0.2
+"""What it counts that a track was fused into an element before, on the scale of squared distance over its gate."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,9 @@ def candidates(
     owner = local.owner[match.station]
     count = np.bincount(owner, minlength=len(local.elements))
     total = np.bincount(owner, weights=match.distance, minlength=len(local.elements))
+    # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
+    squares = np.bincount(owner, weights=match.distance**2, minlength=len(local.elements))
+    fused_before = max(lines[int(element)].evidence.tracks.get(observation.track_id, 0) for element in local.elements)
     found = []
     for position in np.flatnonzero(count):
         element = int(local.elements[position])
@@ -108,8 +111,9 @@ def candidates(
         ):
             continue
         own = np.flatnonzero(owner == position)
-        known = observation.track_id in lines[element].evidence.tracks
-        benefit = count[position] * (1.05 - distance / config.match_distance + (TRACK_BONUS if known else 0.0))
+        known = lines[element].evidence.tracks.get(observation.track_id, 0) / max(fused_before, 1)
+        mismatch = squares[position] / count[position] / config.match_distance**2
+        benefit = count[position] * max(1.0 - mismatch + TRACK_BONUS * known, 0.01)
         found.append(
             Candidate(
                 element,

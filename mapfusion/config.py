@@ -49,7 +49,7 @@ class IntegratorConfig:
     view_full: float = 12.0
     view_far: float = 30.0
     view_floor: float = 0.4
-    prior_log_odds: float = -1.0
+    prior_log_odds: float = -1.2
     hit_log_odds: float = 1.0
     miss_log_odds: float = 0.7
     min_observations: int = 2

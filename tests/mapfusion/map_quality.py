@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
-
 from tests.mapfusion.simulation import ROI, Drive, Ghost
 
 Float = NDArray[np.float64]

@@ -98,10 +98,8 @@ def town_road(rng: np.random.Generator) -> tuple[GlobalMap, Road]:
     junctions = [120.0, 270.0]
     edges = [0.0, *(edge for s in junctions for edge in (s - 14.0, s + 14.0)), 400.0]
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        for d in (-3.5, 3.5):
-            elements.append(element(DIVIDER, road.along(start, stop, d)))
-        for d in (-0.15, 0.15) if start > 0 else (0.0,):
-            elements.append(element(DIVIDER, road.along(start, stop, d)))
+        middle = (-0.15, 0.15) if start > 0 else (0.0,)
+        elements.extend(element(DIVIDER, road.along(start, stop, d)) for d in (-3.5, *middle, 3.5))
     for side in (-1, 1):
         previous: Float | None = None
         start = 0.0

@@ -1,0 +1,74 @@
+"""What a frame costs, and that it does not cost more on a larger map."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from mapfusion import ElementKind, FrameMap, MapIntegrator
+from mapfusion.lines import Curve, Evidence, FusedLine
+from tests.mapfusion.simulation import ROI, pose
+
+pytestmark = pytest.mark.benchmark_only
+
+
+def frames(count: int = 40) -> list[FrameMap]:
+    """A drive past 20 elements per frame: 16 lines along the road and 4 crossings."""
+    rng = np.random.default_rng(0)
+    result = []
+    for number in range(count):
+        x = np.linspace(-30, 30, 20)
+        lines = [np.stack([x, np.full(20, y) + rng.normal(0, 0.2)], axis=1) for y in np.linspace(-14, 14, 16)]
+        rings = []
+        for k in range(4):
+            near = 40.0 * np.round((5.0 * number + 15.0 * k - 25.0) / 40.0) - 5.0 * number
+            corners = np.array([[0, -6], [4, -6], [4, 6], [0, 6], [0, -6]])
+            corners = np.clip(corners + np.array([near + 5.0 * k, 0.0]), [-30, -15], [30, 15])
+            rings.append(corners + rng.normal(0, 0.1, 2))
+        result.append(
+            FrameMap(
+                timestamp=number * 500_000_000,
+                ego_to_global=pose(5.0 * number, 0.0, 0.0),
+                roi=ROI,
+                kinds=np.array([1 + k % 2 for k in range(16)] + [0] * 4),
+                scores=np.full(20, 0.7),
+                track_ids=np.arange(20),
+                polylines=(*lines, *rings),
+            )
+        )
+    return result
+
+
+def filled(size: int) -> MapIntegrator:
+    """An integrator that holds ``size`` lines of 40 m on a square grid, the road among them."""
+    integrator = MapIntegrator()
+    side = int(np.sqrt(size))
+    x = np.linspace(0.0, 40.0, 41)
+    for number in range(size):
+        row, column = divmod(number, side)
+        points = np.stack([x + 50.0 * (column - side // 2), np.full(41, 8.0 * (row - side // 2) + 100.0)], axis=1)
+        ones = np.ones(41)
+        line = FusedLine(ElementKind.DIVIDER, Curve(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {1: 5}))
+        integrator.put_line(number, line)
+    integrator.next_id = size
+    integrator.map()
+    return integrator
+
+
+@pytest.mark.parametrize("size", [1_000, 10_000, 100_000])
+def test_cost_of_add(size, capsys):
+    integrator = filled(size)
+    milliseconds = []
+    for frame in frames():
+        start = time.process_time()
+        integrator.add(frame)
+        milliseconds.append(1e3 * (time.process_time() - start))
+    start = time.process_time()
+    elements = len(integrator.map())
+    map_milliseconds = 1e3 * (time.process_time() - start)
+    median, high = np.percentile(milliseconds, [50, 95])
+    with capsys.disabled():
+        print(f"\n{size:7d} lines: add {median:.2f} ms (95 %: {high:.2f}), map {map_milliseconds:.1f} ms, {elements}")
+    assert median < 10.0
