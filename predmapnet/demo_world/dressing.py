@@ -188,6 +188,6 @@ def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, 
     parking = Parking(solids, forbidden, generator)
     busy = generator.uniform(0.35, 0.9)
     parking.in_bays(vector_map.parking, busy)
-    parking.along_kerbs(road, sight, 0.55 * busy)
+    parking.along_kerbs(road, sight, 0.34 * busy)
     drive(solids, vector_map, road, trajectory, seed)
     return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids())

@@ -76,7 +76,11 @@ def fill_materials(
             out[row, column, 0] = min(255.0, np.sqrt(max(0.0, red * factor)) * 255 + 0.5)
             out[row, column, 1] = min(255.0, np.sqrt(max(0.0, green * factor)) * 255 + 0.5)
             out[row, column, 2] = min(255.0, np.sqrt(max(0.0, blue * factor)) * 255 + 0.5)
-            out[row, column, 3] = shadow[row, column]
+            shade = float(shadow[row, column])
+            if 0 < shade < 255:
+                # Flecks of sun between leaves.
+                shade = min(255.0, max(0.0, shade + blotch * 1.6 * min(shade, 255 - shade)))
+            out[row, column, 3] = shade
 
 
 @kernel

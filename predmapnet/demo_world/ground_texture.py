@@ -177,33 +177,60 @@ def _draw_damage(material: Byte, sheet: _Sheet, road: shapely.Geometry, near: Fl
                 _fill(material, sheet, shapely.Point(spot).buffer(0.33), _INDEX["iron"])
 
 
-def _shade(sheet: _Sheet, world: World, light: Light) -> tuple[Byte, Byte]:
-    """Dark ground below things (ambient occlusion) and their cast shadows; 255 is fully lit."""
+def _fill_convex(image: Byte, sheet: _Sheet, polygons: list[tuple[Float, int]]) -> None:
+    """Darken convex polygons to a value each; of overlapping ones the darkest wins."""
+    if not polygons:
+        return
+    polygons = sorted(polygons, key=lambda pair: -pair[1])
+    lengths = np.array([len(polygon) for polygon, _ in polygons])
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]])
+    points = sheet.to_texels(np.concatenate([polygon for polygon, _ in polygons]))
+    low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+    inside = (high > 0).all(axis=1) & (low < [sheet.columns, sheet.rows]).all(axis=1)
+    fixed = np.round((points - 0.5) * 16).astype(np.int32)
+    for row in np.flatnonzero(inside):
+        cv2.fillConvexPoly(image, fixed[starts[row] : starts[row] + lengths[row]], polygons[row][1], cv2.LINE_8, 4)
+
+
+class _Darkness(NamedTuple):
+    """Outlines that darken the ground: below things that stand, and in their cast shadows."""
+
+    contacts: list[tuple[Float, int]]
+    shadows: list[tuple[Float, int]]
+
+
+def _darkness(world: World, light: Light) -> _Darkness:
+    standing = ~world.solids.velocity.any(axis=1) & world.solids.always
+    shadows = shadow_polygons(world.solids, standing, light.sun_direction) if light.sun.any() else []
+    return _Darkness(contact_polygons(world.solids, standing), shadows)
+
+
+def _shade(sheet: _Sheet, dark: _Darkness) -> tuple[Byte, Byte]:
+    """Ambient occlusion and sunlight on the ground, ``(rows, columns)`` each; 255 is fully lit."""
     occlusion = np.full((sheet.rows, sheet.columns), 255, dtype=np.uint8)
     shadow = np.full_like(occlusion, 255)
-    standing = ~world.solids.velocity.any(axis=1) & world.solids.always
-    for polygon, strength in contact_polygons(world.solids, standing):
-        _fill(occlusion, sheet, Polygon(polygon), int(255 * (1 - strength)))
+    _fill_convex(occlusion, sheet, dark.contacts)
     blur = max(1, round(0.5 / sheet.texel)) | 1
     occlusion = cv2.blur(occlusion, (blur, blur))
-    if light.sun.any():
-        for polygon in shadow_polygons(world.solids, standing, light.sun_direction):
-            _fill(shadow, sheet, Polygon(polygon), 0)
+    if dark.shadows:
+        _fill_convex(shadow, sheet, dark.shadows)
         soft = max(1, round(0.12 / sheet.texel)) | 1
         shadow = cv2.blur(shadow, (soft, soft))
     return occlusion, shadow
 
 
-def _pyramid(sheet: _Sheet, world: World, light: Light, road: shapely.Geometry, near: Float, detailed: bool) -> Pyramid:
+def _pyramid(
+    sheet: _Sheet, world: World, light: Light, road: shapely.Geometry, dark: _Darkness, near: Float | None
+) -> Pyramid:
     material = np.full((sheet.rows, sheet.columns), _INDEX["grass"], dtype=np.uint8)
     for surface in world.surfaces:
         for part in shapely.get_parts(surface.polygon):
             _fill(material, sheet, part, _INDEX[surface.material])
     generator = np.random.default_rng([world.seed, 29])
-    if detailed:
+    if near is not None:
         _draw_damage(material, sheet, road, near, world.seed)
     _draw_kerbs(material, sheet, road, generator)
-    occlusion, shadow = _shade(sheet, world, light)
+    occlusion, shadow = _shade(sheet, dark)
 
     table = np.array(list(MATERIALS.values()), dtype=np.float32)
     if light.wetness > 0:
@@ -252,8 +279,7 @@ def paint_ground(world: World, light: Light) -> tuple[Pyramid, Pyramid]:
     turn = np.array([[axis[0], axis[1]], [-axis[1], axis[0]]])
     near = np.column_stack([positions, np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
     road = road_of(world)
-    fine = _pyramid(_sheet(positions, FINE_MARGIN, FINE_TEXEL, turn, anchor), world, light, road, near, detailed=True)
-    coarse = _pyramid(
-        _sheet(positions, COARSE_MARGIN, COARSE_TEXEL, turn, anchor), world, light, road, near, detailed=False
-    )
+    dark = _darkness(world, light)
+    fine = _pyramid(_sheet(positions, FINE_MARGIN, FINE_TEXEL, turn, anchor), world, light, road, dark, near)
+    coarse = _pyramid(_sheet(positions, COARSE_MARGIN, COARSE_TEXEL, turn, anchor), world, light, road, dark, None)
     return fine, coarse

@@ -183,10 +183,17 @@ def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth
     shine = nx * light.sun_direction[0] + ny * light.sun_direction[1] + nz * light.sun_direction[2]
     ambient = 0.6 + 0.4 * nz
     if mesh.ball_materials[index] == 2:
-        fine = around.white[int(np.floor((y - 0.7 * z) * 13)) & 1023, int(np.floor((x + 0.6 * z) * 13)) & 1023]
-        clump = smooth_noise(around.fractal, (x + 0.5 * z) * 14, (y - 0.4 * z) * 14)
+        # Three planes, weighted by how squarely the surface faces each: no direction is stretched.
+        weight_x, weight_y, weight_z = nx * nx, ny * ny, nz * nz
+        fine = weight_x * smooth_noise(around.white, y * 17, z * 17) + weight_y * smooth_noise(
+            around.white, x * 17, z * 17
+        )
+        fine += weight_z * smooth_noise(around.white, x * 17, y * 17)
+        clump = weight_x * smooth_noise(around.fractal, y * 22, z * 22)
+        clump += weight_y * smooth_noise(around.fractal, x * 22, z * 22)
+        clump += weight_z * smooth_noise(around.fractal, x * 22, y * 22)
         fade = min(1.0, max(0.0, 1.3 - depth / view.focal_x * 9))
-        texture = 0.35 + 0.9 * clump + 0.55 * fade * (fine - 0.5)
+        texture = 0.25 + 1.1 * clump + 0.8 * fade * (fine - 0.5)
         red, green, blue = red * texture, green * texture, blue * texture
         shine = 0.35 * shine + 0.35
         shine *= 0.5 + clump

@@ -65,7 +65,7 @@ def light_of(look: Look, seed: int) -> Light:
     hazy = float(generator.uniform(0.0006, 0.0022))
     if look is Look.DAY:
         return Light(
-            direction, _rgb(1.9, 1.78, 1.55), _rgb(0.50, 0.60, 0.80), _rgb(0.22, 0.42, 0.85), _rgb(0.80, 0.92, 1.10),
+            direction, _rgb(2.5, 2.30, 1.95), _rgb(0.48, 0.58, 0.78), _rgb(0.22, 0.42, 0.85), _rgb(0.80, 0.92, 1.10),
             _rgb(1.25, 1.25, 1.25), cover, hazy, 0.72 * exposure, 0.010, 0.0, 0.0, 0.02, 0.0,
         )  # fmt: skip
     if look is Look.DUSK:

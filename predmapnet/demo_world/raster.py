@@ -264,9 +264,13 @@ def draw_balls(
                     )
                     # sqrt(inside) / square is half the way through the crown, in rays: leaves are sparse at the rim.
                     thickness = inside / np.sqrt(square)
-                    u = int(np.floor((px + 0.37 * py + 0.6 * pz) * 10)) & 1023
-                    v = int(np.floor((py - 0.37 * px - 0.7 * pz) * 10)) & 1023
-                    if noise[v, u] > 0.30 + 1.5 * thickness:
+                    if abs(pz) > 0.6 * radius:
+                        u, v = int(np.floor(px * 8)) & 1023, int(np.floor(py * 8)) & 1023
+                    elif abs(px) > abs(py):
+                        u, v = int(np.floor(py * 8)) & 1023, int(np.floor(pz * 8)) & 1023
+                    else:
+                        u, v = int(np.floor(px * 8)) & 1023, int(np.floor(pz * 8)) & 1023
+                    if noise[v, u] > 0.25 + 1.1 * thickness:
                         continue
                 nearness[row, column] = np.float32(1 / hit)
                 ids[row, column] = first_id + index

@@ -145,7 +145,7 @@ class Renderer:
         chosen[moving] = True
         layers: list[tuple[list[Float], int]] = []
         if self.light.sun.any():
-            layers.append((shadow_polygons(placed, chosen, self.light.sun_direction), 90))
+            layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction)], 90))
         layers.append(([polygon for polygon, _ in contact_polygons(placed, chosen)], 30))
         for polygons, value in layers:
             corners = np.zeros((len(polygons), MOST_CORNERS, 3))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from predmapnet.demo_world.world import Solids
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+
+LEAFY_SHADE = 64
+"""Light left in the shadow of leaves, [0, 255]; flecks of sun are drawn where it is neither 0 nor 255."""
 
 _SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 _ANGLES = np.linspace(0, 2 * np.pi, 12, endpoint=False)
@@ -24,8 +27,8 @@ def _outline(solids: Solids, index: int, grow: float = 0.0) -> Float:
     return local @ np.array([[cosine, sine], [-sine, cosine]]) + solids.centre[index, :2]
 
 
-def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Float, float]]:
-    """Ground below and close to things, and how much of the sky's light it lacks.
+def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Float, int]]:
+    """Ground below and close to things, and how much of the sky's light is left there, [0, 255].
 
     Args:
         solids: all solids of the world.
@@ -33,11 +36,11 @@ def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Floa
     """
     low = solids.centre[:, 2] - solids.size[:, 2] / 2
     rows = np.flatnonzero(mask & (low < 0.4))
-    return [(_outline(solids, row, 0.12), 0.85 if solids.texture[row] == "vehicle" else 0.5) for row in rows]
+    return [(_outline(solids, row, 0.12), 38 if solids.texture[row] == "vehicle" else 128) for row in rows]
 
 
-def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Float32) -> list[Float]:
-    """Convex outlines of the cast shadows on the plane z = 0, ``(k, 2)`` metres each.
+def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Float32) -> list[tuple[Float, int]]:
+    """Convex outlines of the cast shadows on the plane z = 0, ``(k, 2)`` metres each, and the light left, [0, 255].
 
     Args:
         solids: all solids of the world.
@@ -45,27 +48,22 @@ def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Floa
         sun_direction: ``(3,)``, unit vector towards the sun, above the horizon.
     """
     slope = -np.asarray(sun_direction[:2], dtype=np.float64) / max(float(sun_direction[2]), 0.05)
+    # Slices of an ellipsoid: their heights and how much narrower they are than its middle, three of them above it.
+    heights = np.array([-0.8, -0.3, 0.3, 0.8])
+    shrink = np.sqrt(1 - heights**2)
     polygons = []
     for row in np.flatnonzero(mask):
         middle, half = solids.centre[row, 2], solids.size[row, 2] / 2
-        outline = _outline(solids, row)
+        outline, foot = _outline(solids, row), solids.centre[row, :2]
         if solids.shape[row] == "ellipsoid":
-            # Slices of the ellipsoid, each shifted by its height.
-            heights = np.array([-0.8, -0.4, 0.0, 0.4, 0.8])
-            rings = [
-                solids.centre[row, :2]
-                + np.sqrt(1 - h * h) * (outline - solids.centre[row, :2])
-                + slope * (middle + h * half)
-                for h in heights
-            ]
+            rings = (
+                shrink[:, None, None] * (outline - foot) + (foot + (middle + half * heights)[:, None] * slope)[:, None]
+            )
         else:
             # A vehicle's roof is smaller than its floor.
-            roof = (
-                outline
-                if solids.texture[row] != "vehicle"
-                else (solids.centre[row, :2] + 0.75 * (outline - solids.centre[row, :2]))
-            )
-            rings = [outline + slope * max(middle - half, 0.0), roof + slope * (middle + half)]
-        points = np.concatenate(rings)
-        polygons.append(points[ConvexHull(points).vertices])
+            roof = foot + 0.75 * (outline - foot) if solids.texture[row] == "vehicle" else outline
+            rings = np.stack([outline + slope * max(middle - half, 0.0), roof + slope * (middle + half)])
+        # Relative to the foot, single precision is exact enough for any city's coordinates.
+        hull = cv2.convexHull((rings.reshape(-1, 2) - foot).astype(np.float32))[:, 0]
+        polygons.append((hull + foot, LEAFY_SHADE if solids.texture[row] == "foliage" else 0))
     return polygons

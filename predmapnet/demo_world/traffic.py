@@ -135,15 +135,15 @@ def drive(solids: SolidList, vector_map: VectorMap, road: shapely.Geometry, traj
     standing = _parked(solids)
     plans: list[tuple[float, float, Float]] = []
     ahead, behind = generator.uniform(14, 34), generator.uniform(12, 24)
-    if generator.uniform() < 0.75:
+    if generator.uniform() < 0.5:
         plans.append((0.0, 1.0, ego_station + ahead + 3 * np.sin(times / 4 + generator.uniform(0, 6))))
-    if generator.uniform() < 0.6:
+    if generator.uniform() < 0.5:
         plans.append((0.0, 1.0, ego_station - behind - 2 * np.sin(times / 5 + generator.uniform(0, 6))))
-    for _ in range(int(generator.integers(4, 10))):
+    for _ in range(int(generator.integers(3, 7))):
         lateral = float(generator.choice([3.5, 3.6, 7.0]))
         speed = generator.uniform(6, 13)
         plans.append((lateral, -1.0, generator.uniform(40, line.length) - speed * times))
-    for _ in range(int(generator.integers(1, 4))):
+    for _ in range(int(generator.integers(0, 3))):
         lateral = float(generator.choice([-3.5, 3.5, -3.5]))
         plans.append((lateral, 1.0, ego_station + generator.uniform(-30, 45) + generator.uniform(-2, 2) * times))
     taken: list[list[Polygon]] = [[] for _ in times]
