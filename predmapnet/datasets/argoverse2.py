@@ -21,7 +21,7 @@ from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
-from predmapnet.datasets.splits import split_names
+from predmapnet.datasets.splits import SPLITS, check_split, split_names
 from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
@@ -42,14 +42,13 @@ IMAGE_TOLERANCE = 25_000_000
 """An image belongs to a sweep if it lies within half the cameras' shutter interval, nanoseconds."""
 POSES = "city_SE3_egovehicle.feather"
 SWEEP_LIST = "lidar_timestamps_ns.json"
-SPLIT_FOLDERS = ("train", "val", "test")
 
 
 def find_logs(root: Path) -> dict[str, Path]:
     """Return log folders by log id: ``root`` itself, its children, or those of its train, val and test folders."""
     if (root / POSES).is_file():
         return {root.name: root}
-    patterns = [f"*/{POSES}", *(f"{split}/*/{POSES}" for split in SPLIT_FOLDERS)]
+    patterns = [f"*/{POSES}", *(f"{split}/*/{POSES}" for split in SPLITS)]
     return {path.parent.name: path.parent for pattern in patterns for path in sorted(root.glob(pattern))}
 
 
@@ -99,25 +98,29 @@ class Argoverse2Source:
         if self.split_scheme == "disjoint":
             return self._disjoint_split.get(log)
         folder = self._logs[log].parent.name
-        return folder if folder in SPLIT_FOLDERS else "test"
+        return folder if folder in SPLITS else "test"
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List the logs, sorted by folder and id; with the official split, a log outside train and val is ``test``.
 
         With the disjoint split, logs that it does not name are left out.
         """
+        check_split(split)
         infos = [self._info(log) for log in self._logs if self._split(log) is not None]
         return tuple(info for info in infos if split in (None, info.split))
 
     def _info(self, log: str) -> SceneInfo:
         folder = self._logs[log]
+        has_images = (folder / "sensors" / "cameras").is_dir()
+        left_out = log in split_names("argoverse2_skipped")
         return SceneInfo(
             name=log,
             split=self._split(log) or "test",
             frames=len(_key_frames(folder, self.stride)),
             location=_city(folder),
-            ready=(folder / "sensors" / "cameras").is_dir(),
-            description="" if (folder / "sensors" / "cameras").is_dir() else "no images: ground truth only",
+            ready=has_images,
+            description=("" if has_images else "no images: ground truth only")
+            or ("left out of the published training sets" if left_out else ""),
         )
 
     def open(self, scene: str, progress: Progress | None = None) -> Argoverse2Scene:

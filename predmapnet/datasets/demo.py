@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from predmapnet.datasets.georeference import demo_georeference
 from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
 from predmapnet.datasets.source import Progress, SceneInfo
-from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos, scene_number
+from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos
 from predmapnet.errors import UserError
 
 
@@ -49,5 +48,4 @@ class DemoSource:
                 "The rendering is incomplete: delete this folder and it will be made again."
             )
         written.info = dataclasses.replace(info, ready=True)
-        written.georeference = demo_georeference(info.location, scene_number(scene))
         return written

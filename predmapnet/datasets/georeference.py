@@ -103,7 +103,7 @@ def demo_georeference(name: str, index: int) -> SphereGeoreference:
 
     Args:
         name: of the town.
-        index: number of the town in the demo world, from 0.
+        index: seed of the town, from 0; towns may be 10 km across.
     """
     row, column = divmod(index, 20)
     return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)

@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
-from predmapnet.datasets.georeference import nuscenes_georeference
+from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
+from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
-from predmapnet.datasets.splits import split_names
+from predmapnet.datasets.splits import check_split, split_names
 from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
@@ -31,6 +32,11 @@ SPLIT_LISTS = {
     "mini": {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"},
     "disjoint": {"train": "nuscenes_new_train", "val": "nuscenes_new_val"},
 }
+
+
+DEMO_MARKER = "demo_world.json"
+"""A data set with this file in its root was rendered by the demo world."""
+LEFT_OUT = "left out of the published training sets"
 
 
 def find_versions(root: Path) -> tuple[str, ...]:
@@ -71,11 +77,10 @@ class NuScenesSource:
         name: ``nuscenes``.
         root: folder with ``v1.0-*``, ``samples`` and ``maps``.
         version: name of the table folder that is read.
-        synthetic: False.
+        synthetic: whether its images were rendered, as the demo world's marker file says.
     """
 
     name = "nuscenes"
-    synthetic = False
 
     def __init__(self, root: Path, version: str | None = None, split_scheme: str | None = None) -> None:
         """Find the tables; nothing is read yet.
@@ -90,6 +95,7 @@ class NuScenesSource:
             UserError: nothing to open.
         """
         self.root = Path(root)
+        self.synthetic = (self.root / DEMO_MARKER).is_file()
         self.version = choose_version(self.root, version)
         if split_scheme is None:
             split_scheme = "mini" if self.version == "v1.0-mini" else "official"
@@ -110,6 +116,7 @@ class NuScenesSource:
         Scenes that no split list names (one's own logs in this schema) are given as ``test``; with the disjoint
         split, the four scenes that it leaves out are left out.
         """
+        check_split(split)
         names = [name for name in self.tables.scenes if self.split_scheme != "disjoint" or name in self._split_of]
         infos = tuple(self._info(name) for name in names)
         return infos if split is None else tuple(info for info in infos if info.split == split)
@@ -124,7 +131,7 @@ class NuScenesSource:
             split=self._split_of.get(name, "test"),
             frames=int(record["nbr_samples"]),
             location=str(log["location"]),
-            description=str(record.get("description", "")),
+            description=LEFT_OUT if name in split_names("nuscenes_skipped") else str(record.get("description", "")),
         )
 
     def open(self, scene: str, progress: Progress | None = None) -> NuScenesScene:
@@ -136,7 +143,14 @@ class NuScenesSource:
                 f"{self.tables.folder} holds no scene '{scene}' among its {len(self.tables.scenes)} scenes.{hint}"
             )
         info = self._info(scene)
-        return NuScenesScene(self.root, self.tables, info, self._ground_truth(info.location))
+        return NuScenesScene(self.root, self.tables, info, self._ground_truth(info.location), self._georeference(info))
+
+    def _georeference(self, info: SceneInfo) -> Georeference | None:
+        """Where the map lies; rendered towns carry a borrowed location and belong into the ocean."""
+        if not self.synthetic:
+            return nuscenes_georeference(info.location)
+        marker = read_map(self.root / DEMO_MARKER)[0]
+        return demo_georeference(f"demo world, {info.name}", int(marker.get("town_seed", 0)))
 
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
         if location not in self._maps:
@@ -171,7 +185,7 @@ class NuScenesScene:
         tables: Tables,
         info: SceneInfo,
         ground_truth: NuScenesGroundTruth | None,
-        georeference: Georeference | None = None,
+        georeference: Georeference | None,
     ) -> None:
         """Read the scene's records.
 
@@ -180,11 +194,11 @@ class NuScenesScene:
             tables: of the version.
             info: the scene's line in the listing.
             ground_truth: its map, if there is one.
-            georeference: instead of that of the location.
+            georeference: where the global frame lies on Earth, if that is known.
         """
         self.info = info
         self.ground_truth = ground_truth
-        self.georeference = georeference or nuscenes_georeference(info.location)
+        self.georeference = georeference
         self._root = root
         self._tables = tables
         self._frames = self._read_frames()

@@ -103,8 +103,18 @@ def mask_iou(first: Mask, second: Mask) -> Float:
     Returns:
         ``(n, m) float64``; 0 where both are empty.
     """
-    # float32 counts pixels exactly up to 2**24, and its product runs at full speed.
-    together = (first.astype(np.float32) @ second.astype(np.float32).T).astype(np.float64)
-    either = first.sum(axis=1)[:, None].astype(np.float64) + second.sum(axis=1)[None] - together
-    iou: Float = np.divide(together, either, out=np.zeros_like(together), where=either > 0)
+    # Counting bits is several times as fast as a product of matrices, and starts no threads.
+    first_bits, second_bits = _packed(first), _packed(second)
+    together = np.bitwise_count(first_bits[:, None] & second_bits[None]).sum(axis=2, dtype=np.int64)
+    first_area = np.bitwise_count(first_bits).sum(axis=1, dtype=np.int64)
+    second_area = np.bitwise_count(second_bits).sum(axis=1, dtype=np.int64)
+    either = first_area[:, None] + second_area[None] - together
+    iou: Float = np.divide(together, either, out=np.zeros(together.shape), where=either > 0)
     return iou
+
+
+def _packed(masks: Mask) -> NDArray[np.uint64]:
+    """``(n, pixels)`` of 0 and 1 as ``(n, words)`` of 64 pixels each."""
+    packed = np.packbits(masks, axis=1)
+    padding = -packed.shape[1] % 8
+    return np.ascontiguousarray(np.pad(packed, ((0, 0), (0, padding)))).view(np.uint64)

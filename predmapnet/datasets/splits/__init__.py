@@ -5,6 +5,16 @@ from __future__ import annotations
 from functools import cache
 from importlib.resources import files
 
+from predmapnet.errors import UserError
+
+SPLITS = ("train", "val", "test")
+
+
+def check_split(split: str | None) -> None:
+    """Raise UserError for a split that no data set has; None means all."""
+    if split is not None and split not in SPLITS:
+        raise UserError(f"There is no split '{split}'. There are: {', '.join(SPLITS)}.")
+
 
 @cache
 def split_names(name: str) -> tuple[str, ...]:

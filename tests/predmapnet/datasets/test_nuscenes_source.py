@@ -89,6 +89,22 @@ def test_the_map_of_the_whole_scene(nuscenes_root):
     assert truth.elements[1].observations == 3
 
 
+def test_a_rendered_data_set_is_synthetic_and_lies_in_the_ocean(nuscenes_root):
+    real = NuScenesSource(nuscenes_root)
+    assert not real.synthetic
+    assert real.open("scene-0061").georeference.name == "singapore-onenorth"
+    (nuscenes_root / "demo_world.json").write_text('{"synthetic": true, "town_seed": 103}')
+    rendered = NuScenesSource(nuscenes_root)
+    assert rendered.synthetic
+    ((longitude, latitude),) = rendered.open("scene-0061").georeference.to_wgs84(np.zeros((1, 2)))
+    assert -50 < latitude < -40 and -124 < longitude < -121
+
+
+def test_a_split_that_does_not_exist_is_an_error(nuscenes_root):
+    with pytest.raises(UserError, match="no split 'vall'"):
+        NuScenesSource(nuscenes_root).scenes("vall")
+
+
 def test_a_missing_image_leaves_the_camera_in_the_rig(nuscenes_root):
     scene = NuScenesSource(nuscenes_root).open("scene-0061")
     scene.frame(0).images["CAM_BACK"].unlink()
