@@ -10,14 +10,12 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap
+from predmapnet.datasets.ground_truth.vectors import SIMPLIFICATION
 from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
-
-SIMPLIFY_TOLERANCE = 0.2
-"""Metres; the official evaluation simplifies the ground truth by this much before it measures."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def simplified(polylines: Sequence[Float]) -> tuple[Float, ...]:
         counts = [len(polylines[row]) for row in drawable]
         coordinates = np.concatenate([polylines[row] for row in drawable])
         lines = shapely.linestrings(coordinates, indices=np.repeat(np.arange(len(drawable)), counts))
-        shorter = shapely.simplify(lines, SIMPLIFY_TOLERANCE, preserve_topology=True)
+        shorter = shapely.simplify(lines, SIMPLIFICATION, preserve_topology=True)
         vertices, owner = shapely.get_coordinates(shorter, return_index=True)
         parts = np.split(vertices, np.searchsorted(owner, np.arange(1, len(drawable))))
         for row, points in zip(drawable, parts, strict=True):
