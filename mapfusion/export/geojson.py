@@ -30,7 +30,10 @@ WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
 class Georeference(Protocol):
     """From the metric global frame to WGS84."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the frame, for the file's metadata."""
+        ...
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
