@@ -30,12 +30,11 @@ def batch(
     Writes NAME.geojson and NAME.summary.json of each scene, log.jsonl and summary.json. The exit code is 1 if any
     scene failed.
     """
-    from predmapnet.weights.checkpoint import weights_hash
-
     from cli.console import err, progress_display, say_outcomes
     from predmapnet.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
     from predmapnet.datasets.selection import open_source
     from predmapnet.threads import available_cores
+    from predmapnet.weights.checkpoint import weights_hash
 
     names = list(scenes or [])
     if len(names) == 1 and Path(names[0]).is_dir():

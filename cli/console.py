@@ -105,7 +105,7 @@ def report_lines(report: SceneReport) -> list[str]:
     if report.accuracy is not None:
         accuracy = report.accuracy
         lines.append(
-            f"against the ground truth: mAP {accuracy.frame_map:.3f} of the frames; "
+            f"against the ground truth: mAP {accuracy.mean_ap:.3f} of the frames; "
             f"precision {accuracy.precision:.3f} and recall {accuracy.recall:.3f} of the map at 1.0 m"
         )
     lines.extend(f"written: {path}" for path in report.written)
@@ -142,6 +142,6 @@ def _figures(outcome: Outcome) -> list[str]:
     if outcome.report is None:
         return []
     report, accuracy = outcome.report, outcome.report["accuracy"]
-    measured = [f"{accuracy[name]:.3f}" for name in ("frame_map", "precision", "recall")] if accuracy else []
+    measured = [f"{accuracy[name]:.3f}" for name in ("mean_ap", "precision", "recall")] if accuracy else []
     elements, metres = sum(report["elements"].values()), sum(report["metres"].values())
     return [str(elements), f"{metres:.0f}", f"{report['frames_per_second']:.1f}", *measured]

@@ -45,11 +45,11 @@ class Accuracy:
     """How a run compares with the ground truth.
 
     Attributes:
-        frame_map: chamfer mAP of the frames at the thresholds of the benchmark.
+        mean_ap: chamfer mAP of the frames at the thresholds of the benchmark.
         precision, recall: of the global map, length-weighted, at 1.0 m, inside the area that was seen.
     """
 
-    frame_map: float
+    mean_ap: float
     precision: float
     recall: float
 
@@ -219,8 +219,8 @@ def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | No
     at_one_metre = THRESHOLDS.index(1.0)
     # An empty map has no precision; it is reported as 0, since nothing in it is right.
     precision, recall = np.nan_to_num([quality.precision[at_one_metre], quality.recall[at_one_metre]])
-    frame_map = chamfer_average_precision(frames, thresholds_for(roi)).mean
-    return Accuracy(frame_map, float(precision), float(recall))
+    mean_precision = chamfer_average_precision(frames, thresholds_for(roi)).mean
+    return Accuracy(mean_precision, float(precision), float(recall))
 
 
 def describe(provenance: Mapping[str, Any]) -> str:

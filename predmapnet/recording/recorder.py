@@ -96,16 +96,16 @@ class SceneRecorder:
 
     def _log_car(self, roi: RegionOfInterest) -> None:
         length, width, height = CAR_SIZE_METRES
-        # The ego origin of both data sets lies near the rear axle.
+        # The ego origin lies over the rear axle (Argoverse 2) or under the lidar, ahead of it (nuScenes).
         box = rr.Boxes3D(
-            centers=[[0.29 * length, 0.0, height / 2]],
+            centers=[[0.2 * length, 0.0, height / 2]],
             sizes=[CAR_SIZE_METRES],
             colors=(235, 235, 240),
             fill_mode="solid",
         )
         corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * roi.size / 2
         border = rr.LineStrips3D([_lift(corners, 0.0)], colors=(70, 74, 84), radii=rr.Radius.ui_points(0.6))
-        outline = np.array([[-0.21, -0.5], [0.79, -0.5], [0.79, 0.5], [-0.21, 0.5], [-0.21, -0.5]]) * [length, width]
+        outline = np.array([[-0.3, -0.5], [0.7, -0.5], [0.7, 0.5], [-0.3, 0.5], [-0.3, -0.5]]) * [length, width]
         self._recording.log("world/ego_vehicle/car", box, static=True)
         self._recording.log("world/ego_vehicle/region_of_interest", border, static=True)
         for name, ring, colour in (

@@ -23,25 +23,28 @@ START_TIME = 1_500_000_000_000_000
 LOCATION = "singapore-onenorth"
 """The only names that the reader can place on Earth are those of the real maps."""
 
+EMPTY_LAYERS = (
+    "drivable_area",
+    "road_block",
+    "lane",
+    "lane_connector",
+    "ped_crossing",
+    "walkway",
+    "stop_line",
+    "carpark_area",
+    "lane_divider",
+    "traffic_light",
+    "arcline_path_3",
+    "connectivity",
+)
+
 
 def write_tiny_nuscenes(root: Path, scenes: tuple[str, ...] = ("scene-0001",), frames: int = 3) -> Path:
     """Write tables, images of noise and stripes, and a map with one straight road."""
-    tables: dict[str, list[dict]] = {
-        name: []
-        for name in [
-            "scene",
-            "sample",
-            "sample_data",
-            "ego_pose",
-            "calibrated_sensor",
-            "sensor",
-            "log",
-            "map",
-        ]  # as in nuScenes
-    }
-    tables["log"].append(
-        {"token": "log", "logfile": "n015", "vehicle": "n015", "date_captured": "2018-07-24", "location": LOCATION}
-    )
+    names = ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor", "log", "map")
+    tables: dict[str, list[dict]] = {name: [] for name in names}
+    log = {"token": "log", "logfile": "n015", "vehicle": "n015", "date_captured": "2018-07-24", "location": LOCATION}
+    tables["log"].append(log)
     tables["map"].append({"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": ""})
     for channel in (*CAMERAS, "LIDAR_TOP"):
         modality = "lidar" if channel == "LIDAR_TOP" else "camera"
@@ -111,7 +114,7 @@ def _write_frame(
     root: Path, tables: dict[str, list[dict]], scene: str, token: str, tokens: list[str], index: int, number: int
 ) -> None:
     timestamp = START_TIME + index * 500_000
-    before, after = ([""] + tokens)[index], ([*tokens, ""])[index + 1]
+    before, after = (["", *tokens])[index], ([*tokens, ""])[index + 1]
     tables["sample"].append(
         {"token": token, "timestamp": timestamp, "prev": before, "next": after, "scene_token": scene}
     )
@@ -147,27 +150,10 @@ def _write_frame(
 def _write_map(root: Path) -> None:
     """One road along x with a divider in the middle of it, in the schema of the map expansion."""
     corners = [(400.0, 490.0), (700.0, 490.0), (700.0, 510.0), (400.0, 510.0)]
-    nodes = [
-        {"token": f"node-{i}", "x": x, "y": y} for i, (x, y) in enumerate([*corners, (400.0, 500.0), (700.0, 500.0)])
-    ]
+    points = [*corners, (400.0, 500.0), (700.0, 500.0)]
+    nodes = [{"token": f"node-{i}", "x": x, "y": y} for i, (x, y) in enumerate(points)]
     polygon = {"token": "polygon", "exterior_node_tokens": [f"node-{i}" for i in range(4)], "holes": []}
-    document: dict[str, object] = {
-        layer: []
-        for layer in [
-            "drivable_area",
-            "road_block",
-            "lane",
-            "lane_connector",
-            "ped_crossing",
-            "walkway",
-            "stop_line",
-            "carpark_area",
-            "lane_divider",
-            "traffic_light",
-            "arcline_path_3",
-            "connectivity",
-        ]
-    }
+    document: dict[str, object] = {layer: [] for layer in EMPTY_LAYERS}
     document |= {
         "version": "1.3",
         "canvas_edge": [1585.6, 2025.0],

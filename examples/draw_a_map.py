@@ -1,0 +1,36 @@
+"""Draw a map as an SVG picture, without any plotting library.
+
+python examples/draw_a_map.py map.geojson map.svg
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mapfusion import ElementKind, GlobalMap
+from mapfusion.export.geojson import read_geojson
+
+COLOURS = {ElementKind.PED_CROSSING: "#56b4e9", ElementKind.DIVIDER: "#ffb000", ElementKind.BOUNDARY: "#40d689"}
+PIXELS_PER_METRE = 4.0
+MARGIN_METRES = 10.0
+
+
+def draw(global_map: GlobalMap) -> str:
+    points = np.concatenate([element.points for element in global_map])
+    low, high = points.min(axis=0) - MARGIN_METRES, points.max(axis=0) + MARGIN_METRES
+    width, height = (high - low) * PIXELS_PER_METRE
+    lines = []
+    for element in global_map:
+        # SVG's y points down, the map's north.
+        pixels = (element.points - [low[0], high[1]]) * [PIXELS_PER_METRE, -PIXELS_PER_METRE]
+        corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
+        style = f'stroke="{COLOURS[element.kind]}" stroke-opacity="{0.3 + 0.7 * element.confidence:.2f}"'
+        lines.append(f'<polyline points="{corners}" fill="none" stroke-width="2" {style}/>')
+    size = f'width="{width:.0f}" height="{height:.0f}"'
+    background = '<rect width="100%" height="100%" fill="#0e1014"/>'
+    return "\n".join([f'<svg xmlns="http://www.w3.org/2000/svg" {size}>', background, *lines, "</svg>\n"])
+
+
+if __name__ == "__main__":
+    Path(sys.argv[2]).write_text(draw(read_geojson(Path(sys.argv[1]))))
