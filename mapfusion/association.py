@@ -100,9 +100,11 @@ def candidates(
     total = np.bincount(owner, weights=match.distance, minlength=len(local.elements))
     # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
     squares = np.bincount(owner, weights=match.distance**2, minlength=len(local.elements))
-    fused_before = max(lines[int(element)].evidence.tracks.get(observation.track_id, 0) for element in local.elements)
+    beside = np.flatnonzero(count)
+    fused = [lines[int(local.elements[i])].evidence.tracks.get(observation.track_id, 0) for i in beside]
+    most = max(max(fused), 1)
     found = []
-    for position in np.flatnonzero(count):
+    for position, frames in zip(beside, fused, strict=True):
         element = int(local.elements[position])
         distance = float(total[position] / count[position])
         shorter = min(len(curve), len(lines[element].curve))
@@ -111,9 +113,8 @@ def candidates(
         ):
             continue
         own = np.flatnonzero(owner == position)
-        known = lines[element].evidence.tracks.get(observation.track_id, 0) / max(fused_before, 1)
         mismatch = squares[position] / count[position] / config.match_distance**2
-        benefit = count[position] * max(1.0 - mismatch + TRACK_BONUS * known, 0.01)
+        benefit = count[position] * max(1.0 - mismatch + TRACK_BONUS * frames / most, 0.01)
         found.append(
             Candidate(
                 element,

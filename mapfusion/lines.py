@@ -154,15 +154,16 @@ def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
     away = np.linalg.norm(piece.points - foot, axis=1)
     start = 0
     # vertices beside the base's end rather than past it would fold the line back
-    end = base[0] if np.sum((base[0] - foot) ** 2) < np.sum((base[-1] - foot) ** 2) else base[-1]
-    inner = base[min(2, len(base) - 1)] if end is base[0] else base[max(len(base) - 3, 0)]
+    at_start = np.sum((base[0] - foot) ** 2) < np.sum((base[-1] - foot) ** 2)
+    end = base[0] if at_start else base[-1]
+    inner = base[min(2, len(base) - 1)] if at_start else base[max(len(base) - 3, 0)]
     outward = (end - inner) / max(float(np.linalg.norm(end - inner)), 1e-9)
     while start < min(3, len(piece)) and (piece.points[start] + shift - end) @ outward < 0.3:
         start += 1
     points = piece.points + np.exp(-away / BLEND_LENGTH)[:, None] * shift
     stop = len(piece)
-    if len(base) > 12 and len(piece) > start:
-        other_end = base[6:] if end is base[0] else base[:-6]
+    if len(base) > 24 and len(piece) > start:
+        other_end = base[-12:] if at_start else base[:12]
         near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
         if near.any():
             stop = max(int(np.argmax(near)), start)

@@ -76,37 +76,55 @@ def observe(
     Returns:
         Lines (clipped to the ROI, resampled) and rings.
     """
-    lines: list[Observation] = []
-    rings: list[Observation] = []
     box = shapely.box(*(-frame_map.roi.size / 2), *(frame_map.roi.size / 2))
-    shapely.prepare(box)
-    for row in np.flatnonzero(frame_map.track_ids >= 0):
+    rows: list[int] = []
+    curves: list[Float] = []
+    for row in np.flatnonzero(frame_map.track_ids >= 0).tolist():
         points = np.asarray(frame_map.polylines[row], dtype=np.float64)
         problem = _element_problem(points, frame_map.kinds[row], frame_map.scores[row], config)
         if problem is not None:
             rejections[problem] += 1
             continue
-        kind = ElementKind(int(frame_map.kinds[row]))
-        pieces = _ring_pieces(points, box) if kind.is_ring else _line_pieces(points, box, frame_map.roi)
+        ring = ElementKind(int(frame_map.kinds[row])).is_ring
+        pieces = _ring_pieces(points, box) if ring else _line_pieces(points, box, frame_map.roi)
         if not pieces:
-            rejections["outside the region of interest" if not kind.is_ring else "ring without area"] += 1
+            rejections["ring without area" if ring else "outside the region of interest"] += 1
         for piece in pieces:
-            local = piece if kind.is_ring else _stations(piece, config.station_spacing)
-            if local is None:
+            curve = piece if ring else _stations(piece, config.station_spacing)
+            if curve is None:
                 rejections["line without length"] += 1
                 continue
-            deviation = config.deviation_near + config.deviation_per_metre * np.hypot(local[:, 0], local[:, 1])
-            (rings if kind.is_ring else lines).append(
-                Observation(
-                    kind=kind,
-                    track_id=int(frame_map.track_ids[row]),
-                    score=float(frame_map.scores[row]),
-                    points=transform_points(frame_map.ego_to_global, local),
-                    information=max(float(frame_map.scores[row]), 0.05) / deviation**2,
-                    view=view_weight(local, frame_map.roi, config),
-                )
+            rows.append(row)
+            curves.append(curve)
+    observations = _observations(frame_map, rows, curves, config)
+    return [o for o in observations if not o.kind.is_ring], [o for o in observations if o.kind.is_ring]
+
+
+def _observations(
+    frame_map: FrameMap, rows: list[int], curves: list[Float], config: IntegratorConfig
+) -> list[Observation]:
+    """Say where the points of curves of the ego frame lie and what they are worth, all at once."""
+    if not rows:
+        return []
+    local = np.concatenate(curves)
+    ends = np.cumsum([len(curve) for curve in curves])
+    deviation = config.deviation_near + config.deviation_per_metre * np.sqrt((local**2).sum(axis=1))
+    points = transform_points(frame_map.ego_to_global, local)
+    view = view_weight(local, frame_map.roi, config)
+    observations = []
+    for row, start, stop in zip(rows, [0, *ends[:-1].tolist()], ends.tolist(), strict=True):
+        score = float(frame_map.scores[row])
+        observations.append(
+            Observation(
+                kind=ElementKind(int(frame_map.kinds[row])),
+                track_id=int(frame_map.track_ids[row]),
+                score=score,
+                points=points[start:stop],
+                information=max(score, 0.05) / deviation[start:stop] ** 2,
+                view=view[start:stop],
             )
-    return lines, rings
+        )
+    return observations
 
 
 def _element_problem(points: Float, kind: int, score: float, config: IntegratorConfig) -> str | None:
@@ -154,5 +172,5 @@ def _stations(points: Float, spacing: float) -> Float | None:
     if distance[-1] < spacing / 2:
         return None
     count = max(round(distance[-1] / spacing), 1) + 1
-    at = np.linspace(0.0, distance[-1], count)
+    at = np.arange(count) * (distance[-1] / (count - 1))
     return np.stack([np.interp(at, distance, points[:, 0]), np.interp(at, distance, points[:, 1])], axis=1)
