@@ -15,6 +15,7 @@ from shapely import LineString, Polygon, STRtree
 
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose
+from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA
 from predmapnet.datasets.ground_truth.lane_dividers import (
     LaneSide,
     Sides,
@@ -44,7 +45,6 @@ from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 
-MINIMUM_CROSSING_AREA = 1.0
 TILT_MARGIN = 5.0
 """Crossings are moved to the ego frame with roll and pitch; those this far outside the patch cannot come in."""
 
@@ -147,7 +147,7 @@ class Argoverse2GroundTruth:
         kept = [
             (contour, int(row))
             for contour, row in zip(contours, near, strict=True)
-            if contour is not None and len(contour) >= 4 and Polygon(contour).area >= MINIMUM_CROSSING_AREA
+            if contour is not None and len(contour) >= 4 and Polygon(contour).area >= MINIMUM_AREA
         ]
         return [contour for contour, _ in kept], [row for _, row in kept]
 
@@ -215,7 +215,11 @@ class Argoverse2GroundTruth:
         boundaries = cut_rings(self.rings, area) if self.rings else []
         dividers = off_boundaries([shapely.get_coordinates(line) for line in lines], boundaries)
         return [
-            *((ElementKind.PED_CROSSING, shapely.get_coordinates(polygon.exterior)) for polygon in crossings),
+            *(
+                (ElementKind.PED_CROSSING, shapely.get_coordinates(polygon.exterior))
+                for polygon in crossings
+                if polygon.area >= MINIMUM_AREA
+            ),
             *((ElementKind.DIVIDER, line) for line in dividers),
             *((ElementKind.BOUNDARY, line) for line in boundaries),
         ]

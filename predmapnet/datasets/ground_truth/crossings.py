@@ -20,6 +20,7 @@ ALIGNED = 0.001
 FILLED = 0.8
 """A union must fill this part of its convex hull."""
 MINIMUM_AREA = 1.0
+"""Crossings below this area, square metres, are crumbs."""
 MINIMUM_COVERED_AREA = 20.0
 """Below this area, square metres, a crossing that another one covers is dropped."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.ground_truth.crossings import merge_crossings
+from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA, merge_crossings
 from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
@@ -168,7 +168,11 @@ class NuScenesGroundTruth:
         dividers, _ = self._layers["dividers"].cut(area, "LineString", everywhere)
         boundaries = cut_rings(self.rings, area) if self.rings else []
         return [
-            *((ElementKind.PED_CROSSING, shapely.get_coordinates(polygon.exterior)) for polygon in crossings),
+            *(
+                (ElementKind.PED_CROSSING, shapely.get_coordinates(polygon.exterior))
+                for polygon in crossings
+                if polygon.area >= MINIMUM_AREA
+            ),
             *((ElementKind.DIVIDER, shapely.get_coordinates(line)) for line in dividers),
             *((ElementKind.BOUNDARY, line) for line in boundaries),
         ]

@@ -90,11 +90,16 @@ def keep_corners(polygons: Sequence[Polygon], contours: Sequence[Float | None], 
     """
     return [
         contour
-        if contour is not None
-        and abs(shapely.Polygon(contour).area - shapely.Polygon(polygon.exterior).area) < ROUNDING
+        if contour is not None and abs(_enclosed(contour) - shapely.Polygon(polygon.exterior).area) < ROUNDING
         else crossing_contours([_snap_to_border(polygon, box)], box)[0]
         for polygon, contour in zip(polygons, contours, strict=True)
     ]
+
+
+def _enclosed(ring: Float) -> float:
+    """Area inside a closed ring of any number of points, square metres."""
+    x, y = (ring - ring[0]).T
+    return abs(float(x[:-1] @ y[1:] - x[1:] @ y[:-1])) / 2
 
 
 def _snap_to_border(polygon: Polygon, box: Polygon) -> Polygon:

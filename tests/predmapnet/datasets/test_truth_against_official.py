@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import shapely
 
-from mapfusion.elements import RegionOfInterest
+from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.raster import semantic_mask
@@ -171,6 +171,20 @@ def test_masks(cases):
             # Ends of our own lines on the border may fall into the next pixel by the last bit.
             own = semantic_mask(truth.kinds, truth.polylines, roi)
             assert np.count_nonzero(own != official) <= 12
+
+
+def test_the_whole_map_of_a_log_holds_what_its_frames_see(reference):
+    for info in (source := Argoverse2Source(reference("ground_truth", "av2", "logs"))).scenes():
+        scene = source.open(info.name)
+        whole = scene.truth_map()
+        for kind in ElementKind:
+            lines = shapely.union_all([shapely.LineString(element.points) for element in whole.of_kind(kind)])
+            for index in range(0, len(scene), 6):
+                pose = scene.pose(index)
+                for line in pieces(scene.truth(index, RegionOfInterest()), kind):
+                    there = shapely.points(line @ pose[:2, :2].T + pose[:2, 3])
+                    # Frames simplify dividers by 0.2 m.
+                    assert shapely.distance(there, lines).max() < 0.3
 
 
 def test_the_real_six_camera_sample(reference):
