@@ -44,8 +44,8 @@ def batch(
     chosen = choose_scenes(source, names, split)
     prepare_folder(out)
     settings = BatchSettings(
-        dataset,
-        data_root,
+        source.name,
+        source.root,
         weights,
         device,
         allow_missing_cameras,

@@ -42,14 +42,15 @@ class BatchSettings:
     """How every scene of a batch is mapped; the same for all, and sent to the processes.
 
     Attributes:
-        dataset, data_root, weights, device: as for a single scene.
+        dataset, data_root: name and folder of the source that was opened.
+        weights, device: as for a single scene.
         allow_missing_cameras: go on where a camera has no image.
         recordings, frames: write these files too.
         threads: CPU threads of each process.
     """
 
-    dataset: str | None = None
-    data_root: Path | None = None
+    dataset: str
+    data_root: Path
     weights: Path | None = None
     device: str = "auto"
     allow_missing_cameras: bool = False
@@ -176,8 +177,7 @@ def map_scenes(
         jobs: number of processes.
         weights_sha256: of the weights that ``settings`` name.
     """
-    for leftover in folder.glob(".*.part"):
-        leftover.unlink(missing_ok=True)
+    remove_unfinished(folder)
     fingerprint = settings_hash(settings, weights_sha256)
     todo: list[str] = []
     for scene in scenes:
@@ -222,21 +222,31 @@ def _in_pool(
                         yield future.result()
                 if broken:
                     broken.extend(running.values())
+                    running.clear()
                     break
         finally:
-            _stop(pool)
+            if running:
+                _stop(pool, folder)
+            else:
+                pool.shutdown()
     return broken
 
 
-def _stop(pool: ProcessPoolExecutor) -> None:
-    """End a pool at once; scenes that are being mapped leave nothing."""
+def _stop(pool: ProcessPoolExecutor, folder: Path) -> None:
+    """End a pool at once (Ctrl-C); scenes that are being mapped leave nothing."""
     workers = list((getattr(pool, "_processes", None) or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
     for worker in workers:
-        worker.terminate()
-    for worker in workers:
-        worker.join(timeout=5.0)
         worker.kill()
+    for worker in workers:
+        worker.join()
+    pool.shutdown(wait=False, cancel_futures=True)
+    remove_unfinished(folder)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove files that were being written when a process was killed."""
+    for leftover in folder.glob(".*.part"):
+        leftover.unlink(missing_ok=True)
 
 
 _pipeline: MappingPipeline | None = None
@@ -246,13 +256,8 @@ _pipeline: MappingPipeline | None = None
 def _begin_worker(settings: BatchSettings) -> None:
     # Ctrl-C is the parent's business; it ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     use_threads(settings.threads)
-
-
-def _leave(signal_number: int, frame: object) -> None:
-    raise SystemExit(128 + signal_number)
 
 
 def _end_with_parent() -> None:

@@ -18,6 +18,9 @@ def use_threads(count: int) -> int:
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         if not (variable == "NUMBA_NUM_THREADS" and "numba" in sys.modules):
             os.environ[variable] = str(threads)
+    # Threads that wait must not spin: measured on two busy cores, mapping is twice as fast and takes a third of the
+    # CPU time, because the thread that reads images ahead and the recording get their turn.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import cv2
     import torch
 
