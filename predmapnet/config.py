@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.errors import UserError
@@ -99,6 +99,12 @@ class HistoryMapConfig(Section):
     beta: Fraction = 0.9
     threshold: Fraction = 0.5
     """theta of Sec. 3.4."""
+
+    @model_validator(mode="after")
+    def _guidance_needs_memory(self) -> Self:
+        if self.guidance and not self.memory:
+            raise ValueError("guidance reads the memory: switch memory on, or guidance off as well")
+        return self
 
 
 class FutureConfig(Section):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 
 from predmapnet.config import DepthConfig
-from predmapnet.network.layers import ConvNorm
+from predmapnet.network.layers import ConvNorm, Pointwise
 
 
 class DepthHead(nn.Module):
@@ -14,7 +14,7 @@ class DepthHead(nn.Module):
     def __init__(self, channels: int, config: DepthConfig) -> None:
         super().__init__()
         self.hidden = ConvNorm(channels, channels, 3)
-        self.output = nn.Conv2d(channels, config.bins, 1)
+        self.output = Pointwise(channels, config.bins)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(M, C, h', w')`` to logits ``(M, bins, h', w')``."""

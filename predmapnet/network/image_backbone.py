@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from predmapnet.config import BackboneConfig
-from predmapnet.network.layers import ConvNorm, ResidualBlock
+from predmapnet.network.layers import ConvNorm, Pointwise, ResidualBlock
 
 STRIDE = 4
 """Pixels of the input per pixel of the features."""
@@ -27,7 +27,7 @@ class ImageBackbone(nn.Module):
             )
             for stage, blocks in enumerate(config.blocks)
         )
-        self.laterals = nn.ModuleList(nn.Conv2d(width, config.channels, 1) for width in config.widths)
+        self.laterals = nn.ModuleList(Pointwise(width, config.channels) for width in config.widths)
         self.output = ConvNorm(config.channels, config.channels, 3)
 
     def forward(self, images: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.layers import Perceptron
+from predmapnet.network.layers import Perceptron, Pointwise
 
 
 class MaskHead(nn.Module):
@@ -18,7 +18,7 @@ class MaskHead(nn.Module):
         fine, middle, _ = config.bev.widths
         width = config.decoder.width
         self.stride = config.masks.stride
-        self.features = nn.Conv2d(middle if self.stride == 2 else fine, config.masks.channels, 1)
+        self.features = Pointwise(middle if self.stride == 2 else fine, config.masks.channels)
         self.norm = nn.LayerNorm(width)
         self.embedding = Perceptron(width, width, config.masks.channels)
         self.bias = nn.Parameter(torch.tensor(-1.0))

@@ -73,14 +73,25 @@ class FeedForward(nn.Module):
         return self.norm(tokens + self.perceptron(tokens))
 
 
+class Pointwise(nn.Linear):
+    """A 1x1 convolution as the matrix product that it is; on one CPU thread torch has no fast path for the former."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, C_in, h, w)`` to ``(B, C_out, h, w)``, channels-last in memory."""
+        return super().forward(features.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
 class ConvNorm(nn.Sequential):
     """Convolution without bias and batch norm; ReLU if asked for."""
 
     def __init__(self, channels_in: int, channels_out: int, kernel: int, stride: int = 1, relu: bool = True) -> None:
-        super().__init__(
-            nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False),
-            nn.BatchNorm2d(channels_out),
+        plain = kernel == stride == 1
+        convolution = (
+            Pointwise(channels_in, channels_out, bias=False)
+            if plain
+            else nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False)
         )
+        super().__init__(convolution, nn.BatchNorm2d(channels_out))
         if relu:
             self.append(nn.ReLU(inplace=True))
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import DecoderConfig, PredMapNetConfig
-from predmapnet.network.layers import Attention, FeedForward, Perceptron, sine_code, zero_init
+from predmapnet.network.layers import Attention, FeedForward, Perceptron, Pointwise, sine_code, zero_init
 
 FREQUENCIES = 6
 
@@ -100,7 +100,7 @@ class MapDecoder(nn.Module):
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        self.input = nn.Conv2d(config.bev.widths[0], config.decoder.point_width, 1)
+        self.input = Pointwise(config.bev.widths[0], config.decoder.point_width)
         self.layers = nn.ModuleList(PointLayer(config.decoder, config.roi) for _ in range(config.decoder.layers))
 
     def forward(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.network.layers import ConvNorm
+from predmapnet.network.layers import ConvNorm, Pointwise
 
 
 class SegmentationHead(nn.Module):
@@ -14,8 +14,8 @@ class SegmentationHead(nn.Module):
     def __init__(self, channels: int, classes: int) -> None:
         super().__init__()
         self.hidden = ConvNorm(channels, 32, 3)
-        self.output = nn.Conv2d(32, 4 * classes, 1)
-        nn.init.constant_(self.output.bias, -2.0)  # type: ignore[arg-type]
+        self.output = Pointwise(32, 4 * classes)
+        nn.init.constant_(self.output.bias, -2.0)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, C, H, W)`` to logits ``(B, classes, 2 H, 2 W)``."""

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.ego_motion import relative_motion, warp_bev
 from predmapnet.network.interface import StreamState
-from predmapnet.network.layers import zero_init
+from predmapnet.network.layers import Pointwise, zero_init
 
 
 class TemporalBevFusion(nn.Module):
@@ -22,9 +22,9 @@ class TemporalBevFusion(nn.Module):
         self.config = config.temporal_bev
         self.roi = config.roi
         fine, middle, _ = config.bev.widths
-        self.compress = nn.Conv2d(fine, self.config.channels, 1)
+        self.compress = Pointwise(fine, self.config.channels)
         inputs = len(self.config.distances) * (self.config.channels + 1) + self.config.channels
-        self.mix = nn.Conv2d(inputs, fine, 1)
+        self.mix = Pointwise(inputs, fine)
         self.fine_residual = nn.Conv2d(fine, fine, 3, padding=1)
         self.middle_residual = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
         zero_init(self.fine_residual)

@@ -1,7 +1,7 @@
 """Checkpoints as safetensors files: the network's weights, its configuration, and how it was trained.
 
-Nothing is ever unpickled. The metadata of a file has one key, ``predmapnet`` (several would be written in random order),
-with JSON: ``format``, ``version`` (of the package), ``configuration`` and ``facts`` (data, frames seen, scores).
+Nothing is ever unpickled. The metadata of a file has one key, ``predmapnet`` (several would come in random order), with
+JSON: ``format``, ``version`` (of the package), ``configuration`` and ``facts`` (data, frames seen, scores).
 """
 
 from __future__ import annotations

@@ -24,6 +24,7 @@ def test_the_hyperparameters_of_section_4_1_that_lite_shares():
         ('{"wings": 2}', "wings"),
         ('{"tracking": {"tau_d": 1.5}}', "tracking.tau_d"),
         ('{"decoder": {"queries": "many"}}', "decoder.queries"),
+        ('{"history_map": {"memory": false}}', "guidance reads the memory"),
         ("{", "JSON"),
     ],
 )
