@@ -32,7 +32,9 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Te
     for name, value in tensors.items():
         group, index, slot = name.split(".")
         parameter = optimiser.param_groups[int(group)]["params"][int(index)]
-        optimiser.state[parameter][slot] = value.clone()
+        like = parameter if value.shape == parameter.shape else value
+        # The memory layout of the weight, so that sums run in the same order as without the interruption.
+        optimiser.state[parameter][slot] = torch.empty_like(like).copy_(value)
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

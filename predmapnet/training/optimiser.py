@@ -34,7 +34,8 @@ def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.opt
         {"params": [p for p in parameters if p.ndim >= 2], "weight_decay": settings.weight_decay},
         {"params": [p for p in parameters if p.ndim < 2], "weight_decay": 0.0},
     ]
-    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas, fused=True)
+    # Not fused: on the CPU that pairs the wrong elements where a gradient's memory layout differs from its weight's.
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas)
 
 
 def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> float:

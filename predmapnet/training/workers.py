@@ -66,7 +66,8 @@ class Workers:
         flat /= self.size
         offset = 0
         for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = flat[offset : offset + gradient.numel()].view_as(parameter)
+            # Copied, so that the gradient keeps the memory layout of its weight.
+            parameter.grad = gradient.copy_(flat[offset : offset + gradient.numel()].view_as(parameter))
             offset += gradient.numel()
         return [float(number) for number in flat[offset:]]
 
