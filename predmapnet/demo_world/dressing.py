@@ -184,7 +184,7 @@ def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, 
     _put_up_furniture(solids, road.intersection(sight.buffer(20)), sight, buildings, generator)
     crossings = [crossing.polygon.buffer(2.0) for crossing in vector_map.crossings]
     stops = [polygon.buffer(1.0) for polygon in vector_map.stop_lines]
-    forbidden = shapely.union_all([*crossings, *stops, ego_corridor(trajectory, width=3.4)])
+    forbidden = shapely.union_all([*crossings, *stops, ego_corridor(trajectory, width=4.3)])
     parking = Parking(solids, forbidden, generator)
     busy = generator.uniform(0.35, 0.9)
     parking.in_bays(vector_map.parking, busy)

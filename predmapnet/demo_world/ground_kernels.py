@@ -27,7 +27,8 @@ def fill_materials(
         material: ``(rows, columns)`` index into ``table``.
         origin_x, origin_y: corner of texel (0, 0), metres.
         texel: metres per texel.
-        table: ``(materials, 7)``: red, green, blue albedo, grain, blotches, drift, pattern (1 slabs, 2 growth, 3 brick).
+        table: ``(materials, 7)``: red, green, blue albedo, grain, blotches, drift, pattern
+            (1 slabs, 2 growth, 3 brick).
         fractal, white: noise tiles in [0, 1].
         occlusion, shadow: 255 where nothing darkens the ground.
         out: ``(rows, columns, 4)`` receives the colour and, last, the shadow.
@@ -89,7 +90,7 @@ def _edge(x: float, y: float, quads: Float, index: int, first: int, second: int)
     start_x, start_y = quads[index, first, 0], quads[index, first, 1]
     edge_x, edge_y = quads[index, second, 0] - start_x, quads[index, second, 1] - start_y
     length = np.sqrt(edge_x * edge_x + edge_y * edge_y) + 1e-12
-    return ((y - start_y) * edge_x - (x - start_x) * edge_y) / length
+    return float(((y - start_y) * edge_x - (x - start_x) * edge_y) / length)
 
 
 @kernel

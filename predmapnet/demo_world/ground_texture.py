@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
@@ -13,8 +14,8 @@ from shapely import Polygon
 
 from predmapnet.demo_world.ground_kernels import compose, fill_materials, fill_paint, halve
 from predmapnet.demo_world.looks import Light
-from predmapnet.demo_world.noise import TILE, fractal_tile
-from predmapnet.demo_world.paint import offset_line, paint_quads, ribbon
+from predmapnet.demo_world.noise import fractal_tile
+from predmapnet.demo_world.paint import paint_quads, ribbon
 from predmapnet.demo_world.shadows import contact_polygons, shadow_polygons
 from predmapnet.demo_world.world import World
 
@@ -211,11 +212,11 @@ def _shade(sheet: _Sheet, dark: _Darkness) -> tuple[Byte, Byte]:
     shadow = np.full_like(occlusion, 255)
     _fill_convex(occlusion, sheet, dark.contacts)
     blur = max(1, round(0.5 / sheet.texel)) | 1
-    occlusion = cv2.blur(occlusion, (blur, blur))
+    occlusion = np.asarray(cv2.blur(occlusion, (blur, blur)), dtype=np.uint8)
     if dark.shadows:
         _fill_convex(shadow, sheet, dark.shadows)
         soft = max(1, round(0.12 / sheet.texel)) | 1
-        shadow = cv2.blur(shadow, (soft, soft))
+        shadow = np.asarray(cv2.blur(shadow, (soft, soft)), dtype=np.uint8)
     return occlusion, shadow
 
 
@@ -252,7 +253,7 @@ def _pyramid(
     texels = np.empty((starts[-1], 4), dtype=np.uint8)
     levels = [texels[starts[i] : starts[i + 1]].reshape(*sizes[i], 4) for i in range(LEVELS + 1)]
     compose(base, paint, levels[0])
-    for fine, coarse in zip(levels, levels[1:], strict=False):
+    for fine, coarse in pairwise(levels):
         halve(fine, coarse)
     rows, columns = (np.array(side, dtype=np.int64) for side in zip(*sizes, strict=True))
     placement = np.array([*sheet.origin, sheet.turn[0, 0], sheet.turn[0, 1], 1 / sheet.texel])

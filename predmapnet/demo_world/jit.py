@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numba.core.config
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-if not os.access(Path(__file__).parent, os.W_OK) and not numba.config.CACHE_DIR:
+_CONFIG: Any = numba.core.config
+if not os.access(Path(__file__).parent, os.W_OK) and not _CONFIG.CACHE_DIR:
     # An installation that may not be written to: numba would refuse to cache where the home folder is sealed too.
-    numba.config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"predmapnet-numba-{os.getuid()}")
+    _CONFIG.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"predmapnet-numba-{os.getuid()}")
 
 
 _OPTIONS: dict[str, Any] = {
@@ -37,5 +39,9 @@ def kernel(function: Function) -> Function:
 
 
 def part(function: Function) -> Function:
-    """Compile a part of kernels that is copied into its callers, whose many arguments are then not passed at all."""
+    """Compile a part of kernels that is copied into its callers, whose many arguments are then not passed at all.
+
+    The cache of a kernel notices changes of the kernel's own file only: after editing a part of another file, clear
+    the compiled files (``__pycache__/*.nb?``) or touch the kernel's file.
+    """
     return cast(Function, numba.njit(forceinline=True, **_OPTIONS)(function))

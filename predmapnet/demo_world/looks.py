@@ -85,5 +85,5 @@ def light_of(look: Look, seed: int) -> Light:
         )  # fmt: skip
     return Light(
         direction, _rgb(0.0, 0.0, 0.0), _rgb(0.012, 0.013, 0.020), _rgb(0.006, 0.008, 0.016), _rgb(0.035, 0.030, 0.030),
-        _rgb(0.02, 0.018, 0.018), cover, hazy, 2.1 * exposure, 0.045, 0.25 * float(share > 0.6), 1.0, 0.3, 1.0,
+        _rgb(0.02, 0.018, 0.018), cover, hazy, 1.5 * exposure, 0.040, 0.25 * float(share > 0.6), 1.0, 0.3, 1.0,
     )  # fmt: skip

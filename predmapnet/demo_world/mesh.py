@@ -85,7 +85,7 @@ def _template(parts: list[Part]) -> _Template:
 def _hull(
     low: tuple[float, float, float, float, float], high: tuple[float, float, float, float, float]
 ) -> list[Corners]:
-    """Sides front, left, rear, right and the top of a frustum; each end is (rear x, front x, half width, half width, z)."""
+    """Sides front, left, rear, right and the top of a frustum; an end is (rear x, front x, half widths, z)."""
     x0, x1, w0, w1, z0 = low
     u0, u1, v0, v1, z1 = high
     return [

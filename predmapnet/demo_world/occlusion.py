@@ -18,7 +18,8 @@ def painted_points(renderer: Renderer, spacing: float = 0.5) -> Float:
     """Points along all dividers and around all crossings of a world, ``(n, 2)`` metres, global frame."""
     lines = [shapely.LineString(divider.points) for divider in renderer.world.map.dividers]
     lines += [crossing.polygon.exterior for crossing in renderer.world.map.crossings]
-    return shapely.get_coordinates([shapely.segmentize(line, spacing) for line in lines])
+    points: Float = shapely.get_coordinates([shapely.segmentize(line, spacing) for line in lines])
+    return points
 
 
 def hidden_share(renderer: Renderer, rig: Rig, frame_index: int, roi: RegionOfInterest) -> tuple[int, int]:

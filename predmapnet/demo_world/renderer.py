@@ -23,9 +23,6 @@ from predmapnet.demo_world.world import Solids, World
 
 Float = NDArray[np.float64]
 
-SIGHT = 220.0
-"""Metres beyond which solids are not drawn."""
-
 
 @dataclass(frozen=True)
 class RenderedImage:
@@ -158,7 +155,7 @@ class Renderer:
                 corners[row, : len(kept), :2] = kept
                 counts[row] = len(kept)
             draw_mask(corners, counts, view, value, np.empty((18, 3)), mask)
-        return cv2.blur(mask, (3, 3)) if len(moving) else mask
+        return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if len(moving) else mask
 
     def view(self, camera: Camera, frame_index: int) -> View:
         """Return a camera at a key frame as plain numbers."""
@@ -197,16 +194,11 @@ class Renderer:
         """
         mesh, placed, moving = self.mesh_at(frame_index)
         view, samples = self.view(camera, frame_index), self.supersampling
-        distance = (
-            np.linalg.norm(mesh.corners[:, 0, :2] - view.position[:2], axis=1) if len(mesh.counts) else np.zeros(0)
-        )
-        if (distance > SIGHT).any():
-            near = distance <= SIGHT
-            mesh = Mesh(*(part[near] for part in mesh[:6]), *mesh[6:])
         nearness, ids = self.rasterise(mesh, view, samples)
         around = Surroundings(
             *self._ground, self.light, fractal_tile(0.0, seed=8), fractal_tile(1.0), fractal_tile(1.7, seed=12),
-            self._lamps, self._lamps_origin, inverse_pose(self.world.trajectory.ego_to_global[frame_index]), self._sunlit,
+            self._lamps, self._lamps_origin, inverse_pose(self.world.trajectory.ego_to_global[frame_index]),
+            self._sunlit,
         )  # fmt: skip
         size = (camera.height, camera.width)
         image = np.empty((*size, 3), dtype=np.float32)
@@ -216,7 +208,7 @@ class Renderer:
         shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, found, scratch, image, depth, ground_share)
         if self.light.wetness > 0:
             mirror_in_wet(around, view, ground_share, image)
-        image = cv2.GaussianBlur(image, (3, 3), 0.5 * camera.width / 800)
+        image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0.5 * camera.width / 800), dtype=np.float32)
         name = zlib.crc32(camera.name.encode())
         generator = np.random.default_rng([self.world.seed, name])
         exposure = self.light.exposure * float(np.exp(generator.normal(0, 0.06)))

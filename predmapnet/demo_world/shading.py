@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from predmapnet.demo_world.ground_texture import Pyramid
 from predmapnet.demo_world.jit import part
 from predmapnet.demo_world.looks import Light
-from predmapnet.demo_world.raster import View
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -50,7 +49,7 @@ def _read_level(pyramid: Pyramid, level: int, x: float, y: float) -> Texel:
         blue += weight * b * b
         shade += weight * np.float32(texels[index, 3])
     norm = np.float32(1 / 65025.0)
-    return red * norm, green * norm, blue * norm, shade * np.float32(1 / 255.0)
+    return float(red * norm), float(green * norm), float(blue * norm), float(shade * np.float32(1 / 255.0))
 
 
 @part

@@ -24,7 +24,8 @@ def _outline(solids: Solids, index: int, grow: float = 0.0) -> Float:
     unit = _SQUARE if solids.shape[index] == "box" else _CIRCLE
     cosine, sine = np.cos(solids.yaw[index]), np.sin(solids.yaw[index])
     local = unit * (solids.size[index, :2] + 2 * grow)
-    return local @ np.array([[cosine, sine], [-sine, cosine]]) + solids.centre[index, :2]
+    outline: Float = local @ np.array([[cosine, sine], [-sine, cosine]]) + solids.centre[index, :2]
+    return outline
 
 
 def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Float, int]]:
@@ -35,7 +36,7 @@ def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Floa
         mask: ``(n,) bool``, which to take.
     """
     low = solids.centre[:, 2] - solids.size[:, 2] / 2
-    rows = np.flatnonzero(mask & (low < 0.4))
+    rows = np.flatnonzero(mask & (low < 0.4)).tolist()
     return [(_outline(solids, row, 0.12), 38 if solids.texture[row] == "vehicle" else 128) for row in rows]
 
 
@@ -52,7 +53,7 @@ def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Floa
     heights = np.array([-0.8, -0.3, 0.3, 0.8])
     shrink = np.sqrt(1 - heights**2)
     polygons = []
-    for row in np.flatnonzero(mask):
+    for row in np.flatnonzero(mask).tolist():
         middle, half = solids.centre[row, 2], solids.size[row, 2] / 2
         outline, foot = _outline(solids, row), solids.centre[row, :2]
         if solids.shape[row] == "ellipsoid":
