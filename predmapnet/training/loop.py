@@ -209,6 +209,7 @@ class Trainer:
         self.average = WeightAverage(self.network, settings.average_decay)
         position.total_seconds += position.seconds
         position.stage, position.step, position.seconds = stage.name, 0, 0.0
+        self.network.zero_grad(set_to_none=True)
         stage.begin()
         return make_optimiser(self.network, settings)
 
