@@ -17,8 +17,8 @@ from predmapnet.datasets.source import FrameTruth
 
 Float = NDArray[np.float64]
 
-LINE_THICKNESS = 3
-"""Cells of a drawn line on a grid of 0.3 m, as in MapTracker's BEV target."""
+LINE_THICKNESS = 2
+"""As OpenCV counts: with fractional coordinates it draws lines 3 cells (0.9 m) wide, as in MapTracker's target."""
 SUBPIXEL_BITS = 4
 
 

@@ -1,0 +1,125 @@
+"""A run that dies and goes on gives the same steps, losses and weights as one that never stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import orjson
+import pytest
+import torch
+from painted_scenes import painted_scene, tiny_config
+
+from predmapnet.errors import UserError
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training import checkpoint
+from predmapnet.training.batches import TrainingScenes
+from predmapnet.training.loop import Trainer
+from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings
+from predmapnet.training.single_frame import SingleFrameStage
+from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.workers import Workers
+
+SETTINGS = TrainingSettings(
+    batch=2,
+    single=Budget(steps=5),
+    temporal=Budget(steps=6),
+    checkpoint_minutes=0.0,
+    log_steps=1,
+    # Scores of an untrained network are low; tracks must exist for their state to matter.
+    streams=StreamSettings(streams=2, score=0.03, growth_steps=1, longest=6),
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> TrainingScenes:
+    folder = tmp_path_factory.mktemp("scenes")
+    return TrainingScenes([painted_scene(folder / f"scene-{i}", 6, i, tiny_config()) for i in range(2)])
+
+
+class PowerCutError(Exception):
+    pass
+
+
+def run(folder: Path, scenes: TrainingScenes, resume: bool = False, cut_at: tuple[str, int] | None = None) -> Trainer:
+    torch.manual_seed(3)
+    network = PredMapNet(tiny_config())
+    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
+    trainer = Trainer(network, SETTINGS, folder, Workers(), lambda _line: None)
+    if resume:
+        trainer.resume()
+    single = SingleFrameStage(network, lookup, scenes, SETTINGS, Workers())
+    temporal = TemporalStage(network, lookup, scenes, SETTINGS, folder, Workers(), lambda _line: None)
+    for stage, budget in ((single, SETTINGS.single), (temporal, SETTINGS.temporal)):
+        if cut_at is not None and stage.name == cut_at[0]:
+            cut(stage, cut_at[1])
+        assert budget is not None
+        trainer.run(stage, budget, SETTINGS.optimiser, lambda _network, _stage: {"mAP": 0.0})
+    return trainer
+
+
+def cut(stage: Any, at_step: int) -> None:
+    whole = stage.losses
+
+    def losses(step: int, batch: Any) -> dict[str, torch.Tensor]:
+        if step == at_step:
+            raise PowerCutError
+        return whole(step, batch)
+
+    stage.losses = losses
+
+
+def metrics(folder: Path) -> list[dict[str, Any]]:
+    times = ("seconds", "cpu_seconds", "seconds_per_step")
+    lines = [orjson.loads(line) for line in (folder / "metrics.jsonl").read_bytes().splitlines()]
+    return [{name: value for name, value in line.items() if name not in times} for line in lines]
+
+
+@pytest.mark.parametrize("cut_at", [("single", 3), ("temporal", 3)])
+def test_a_run_that_died_goes_on_as_if_nothing_had_happened(
+    tmp_path: Path, scenes: TrainingScenes, cut_at: tuple[str, int]
+) -> None:
+    straight = run(tmp_path / "straight", scenes)
+    with pytest.raises(PowerCutError):
+        run(tmp_path / "cut", scenes, cut_at=cut_at)
+    resumed = run(tmp_path / "cut", scenes, resume=True)
+    assert metrics(tmp_path / "cut") == metrics(tmp_path / "straight")
+    assert any("forecast" in line and line["forecast"] > 0 for line in metrics(tmp_path / "cut")), "tracks were alive"
+    for network in ("network", "average"):
+        first = getattr(straight, network)
+        second = getattr(resumed, network)
+        for whole, again in zip(
+            (first if network == "network" else first.network).state_dict().values(),
+            (second if network == "network" else second.network).state_dict().values(),
+            strict=True,
+        ):
+            assert torch.equal(whole, again)
+
+
+def test_only_the_newest_checkpoint_stays_and_half_of_one_is_ignored(tmp_path: Path, scenes: TrainingScenes) -> None:
+    run(tmp_path, scenes)
+    assert len(list(tmp_path.glob("step-*"))) == 1
+    (tmp_path / ".step-099999999.partial").mkdir()
+    newest = checkpoint.latest(tmp_path)
+    assert newest is not None
+    assert checkpoint.read_json(newest / "position.json")["finished"] == ["single", "temporal"]
+
+
+def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Path, scenes: TrainingScenes) -> None:
+    with pytest.raises(UserError, match="no checkpoint"):
+        run(tmp_path / "empty", scenes, resume=True)
+    run(tmp_path / "damaged", scenes)
+    newest = checkpoint.latest(tmp_path / "damaged")
+    assert newest is not None
+    (newest / "network.safetensors").write_bytes(b"cut short")
+    with pytest.raises(UserError, match="damaged"):
+        run(tmp_path / "damaged", scenes, resume=True)
