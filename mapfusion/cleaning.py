@@ -35,9 +35,10 @@ def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) ->
         return []
     missed = np.maximum(views.at(curve.points) - curve.seen_view, 0.0)
     odds = log_odds(curve.seen, missed, config)
+    alive = _supported(odds, config.weak_log_odds) & (curve.information > 1.0 / config.max_deviation**2)
     points = smooth(curve, config)
     elements = []
-    for start, stop in _stretches(odds > 0.0, int(config.max_gap / config.station_spacing)):
+    for start, stop in _stretches(alive, int(config.max_gap / config.station_spacing)):
         rows = start + tidy(points[start:stop])
         if len(rows) < 2 or arc_length(points[rows])[-1] < config.min_length:
             continue
@@ -93,6 +94,13 @@ def smooth(curve: Curve, config: IntegratorConfig) -> Float:
     origin = curve.points[0]
     solved = solveh_banded(bands, curve.information[:, None] * (curve.points - origin))
     return np.asarray(solved + origin, dtype=np.float64)
+
+
+def _supported(odds: Float, weak: float) -> NDArray[np.bool_]:
+    """Return where a line exists: more likely than not, or weaker but in one piece with where it does (hysteresis)."""
+    strong, possible = odds > 0.0, odds > weak
+    piece = np.cumsum(np.diff(possible, prepend=False))
+    return np.asarray(possible & np.isin(piece, piece[strong]))
 
 
 def _stretches(alive: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:

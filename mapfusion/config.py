@@ -25,6 +25,9 @@ class IntegratorConfig:
             the weight falls linearly to ``view_floor`` at ``view_far`` metres.
         prior_log_odds: log-odds that something seen never exists.
         hit_log_odds, miss_log_odds: what one sighting adds and one missed sighting takes.
+        weak_log_odds: stretches of a line with less than even odds but more than this stay in the map where they
+            continue a stretch with more than even odds.
+        max_deviation: stretches of a line whose place is known less well are left out of the map, metres.
         min_observations: elements seen in fewer frames are left out of the map.
         min_length: shorter lines are left out of the map, metres.
         min_area: smaller crossings are left out of the map, square metres.
@@ -52,6 +55,8 @@ class IntegratorConfig:
     prior_log_odds: float = -1.2
     hit_log_odds: float = 1.0
     miss_log_odds: float = 0.7
+    weak_log_odds: float = -1.0
+    max_deviation: float = 0.5
     min_observations: int = 2
     min_length: float = 2.0
     min_area: float = 2.0
