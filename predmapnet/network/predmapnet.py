@@ -119,12 +119,13 @@ class PredMapNet(nn.Module):
 
     def decode_bev(self, bev: BevFeatures, inputs: FrameInputs, state: StreamState | None = None) -> FrameOutputs:
         """From BEV features and memory to map instances; of ``inputs`` only the poses are used."""
-        if state is None:
-            state = self.initial_state(len(bev.fine))
         fine, middle, raw = bev.fine, bev.middle, bev.fine.new_zeros(len(bev.fine), 0, *bev.fine.shape[-2:])
         if self.temporal_bev is not None:
             raw = self.temporal_bev.compress(bev.fine)
-            fine, middle = self.temporal_bev(fine, middle, raw, inputs.ego_to_global, state)
+            if state is not None:
+                fine, middle = self.temporal_bev(fine, middle, raw, inputs.ego_to_global, state)
+        if state is None:
+            state = self.initial_state(len(bev.fine))
 
         mask_features = None if self.mask_head is None else self.mask_head.mask_features(fine, middle)
         detections = self.query_generator([bev.coarse, middle, fine], mask_features, self.mask_head)
