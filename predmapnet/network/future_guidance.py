@@ -37,6 +37,7 @@ class ShortTermFutureGuidance(nn.Module):
         Returns:
             ``(B, T, P, 2)``, normalised.
         """
+        history = history.detach()  # What was seen must not be bent towards what is still to come.
         last = history[:, :, -1]
         motion = (history[:, :, :-1] - last[:, :, None]) * valid[:, :, :-1, None, None]
         seen = torch.cat([10.0 * motion.flatten(2), last.flatten(2) - 0.5, valid.to(last.dtype)], dim=-1)

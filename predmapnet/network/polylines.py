@@ -72,5 +72,9 @@ def chamfer_distances(first: Tensor, second: Tensor) -> Tensor:
     Returns:
         ``(M,)``, metres.
     """
-    distances = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
-    return (distances.amin(dim=2).mean(dim=1) + distances.amin(dim=1).mean(dim=1)) / 2
+    # Several times faster than torch.cdist, which knows no short way for two coordinates.
+    x = first[:, :, None, 0] - second[:, None, :, 0]
+    y = first[:, :, None, 1] - second[:, None, :, 1]
+    squared = x.square_().add_(y.square_())
+    forward, backward = squared.amin(dim=2).sqrt().mean(dim=1), squared.amin(dim=1).sqrt().mean(dim=1)
+    return (forward + backward) / 2
