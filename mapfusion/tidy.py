@@ -26,16 +26,16 @@ def tidy(points: Float) -> Integer:
         Ascending rows of ``points``.
     """
     rows = np.arange(len(points))
-    for _ in range(len(points)):
-        spikes = _spikes(points[rows])
-        if not len(spikes):
+    while len(rows) > 2:
+        moved = np.append(True, np.any(points[rows[1:]] != points[rows[:-1]], axis=1))
+        if not moved.all():
+            rows = rows[moved]
+        elif len(spikes := _spikes(points[rows])):
+            rows = np.delete(rows, spikes[:1])
+        elif (loop := _first_loop(points[rows])) is not None:
+            rows = np.delete(rows, np.arange(loop[0] + 1, loop[1] + 1))
+        else:
             break
-        rows = np.delete(rows, spikes[:1])
-    while len(rows) > 3 and not shapely.is_simple(shapely.LineString(points[rows])):
-        loop = _first_loop(points[rows])
-        if loop is None:
-            break
-        rows = np.delete(rows, np.arange(loop[0] + 1, loop[1] + 1))
     return rows
 
 
@@ -57,7 +57,9 @@ def _spikes(points: Float) -> Integer:
 
 
 def _first_loop(points: Float) -> tuple[int, int] | None:
-    """Return the segments ``i < j`` that cross with the fewest segments between them."""
+    """Return the segments ``i < j`` that cross with the fewest segments between them, or None."""
+    if shapely.is_simple(shapely.LineString(points)):
+        return None
     segments = shapely.linestrings(np.stack([points[:-1], points[1:]], axis=1))
     first, second = shapely.STRtree(segments).query(segments, predicate="intersects")
     between = second - first
