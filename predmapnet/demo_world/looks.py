@@ -81,7 +81,7 @@ def light_of(look: Look, seed: int) -> Light:
     if look is Look.WET:
         return Light(
             direction, _rgb(0.0, 0.0, 0.0), _rgb(0.50, 0.53, 0.58), _rgb(0.48, 0.51, 0.56), _rgb(0.62, 0.64, 0.67),
-            _rgb(0.38, 0.40, 0.44), 1.0, 4.0 * hazy, 1.12 * exposure, 0.016, 0.6 + 0.4 * share, 0.1, 0.15, 0.3,
+            _rgb(0.38, 0.40, 0.44), 1.0, 2.2 * hazy, 0.98 * exposure, 0.016, 0.6 + 0.4 * share, 0.1, 0.15, 0.3,
         )  # fmt: skip
     return Light(
         direction, _rgb(0.0, 0.0, 0.0), _rgb(0.012, 0.013, 0.020), _rgb(0.006, 0.008, 0.016), _rgb(0.035, 0.030, 0.030),
