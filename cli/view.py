@@ -36,8 +36,9 @@ def view(
     if what.endswith(".rrd"):
         Viewer.show_file(Path(what), web, port)
         return
-    with Viewer.open(Path(what).stem, web, port, out) as viewer:
-        if what.endswith((".geojson", ".json")):
+    is_map = what.endswith((".geojson", ".json"))
+    with Viewer.open(Path(what).stem, web, port, out, live=not is_map) as viewer:
+        if is_map:
             from predmapnet.recording import log_map_file
 
             log_map_file(viewer.recording, Path(what))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 import time
+import urllib.parse
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,12 @@ from predmapnet.recording import APPLICATION, RecordingFile
 
 GRPC_PORT_OFFSET = 1
 """The data behind a web viewer is served on the port after the viewer's own."""
+
+
+def web_address(port: int) -> str:
+    """Address of a web viewer that shows what is served beside it."""
+    data = urllib.parse.quote(f"rerun+http://localhost:{port + GRPC_PORT_OFFSET}/proxy", safe="")
+    return f"http://localhost:{port}?url={data}"
 
 
 def has_display() -> bool:
@@ -38,8 +45,8 @@ class Viewer:
     recording: rr.RecordingStream
 
     @classmethod
-    @contextmanager
-    def open(cls, name: str, web: bool, port: int, file: Path | None) -> Iterator[Viewer]:
+    @contextlib.contextmanager
+    def open(cls, name: str, web: bool, port: int, file: Path | None, live: bool) -> Iterator[Viewer]:
         """Open a viewer for the block: on the web, in a file, or in a window if there is a display.
 
         Args:
@@ -47,16 +54,19 @@ class Viewer:
             web: serve on ``port`` until Ctrl-C.
             port: of the web viewer.
             file: write a recording here instead.
+            live: something is mapped in the block, so that it is worth looking before the block ends.
         """
         recording = rr.RecordingStream(APPLICATION, recording_id=name)
         if web:
             server = recording.serve_grpc(grpc_port=port + GRPC_PORT_OFFSET)
             rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=server)
-            out.print(f"Open http://localhost:{port}?url={server.replace('127.0.0.1', 'localhost')}", markup=False)
+            if live:
+                out.print(f"Open {web_address(port)} in a browser to watch.", markup=False)
             yield cls(recording)
-            out.print("Serving; stop with Ctrl-C.")
-            while True:
-                time.sleep(3600)
+            out.print(f"Open {web_address(port)} in a browser; stop with Ctrl-C.", markup=False)
+            with contextlib.suppress(KeyboardInterrupt):
+                while True:
+                    time.sleep(3600)
         elif file is None and has_display():
             recording.spawn()
             yield cls(recording)
@@ -78,9 +88,11 @@ class Viewer:
             raise UserError(f"there is no recording {path}")
         command = [sys.executable, "-m", "rerun", str(path)]
         if web:
-            out.print(f"Serving the viewer on http://localhost:{port}; stop with Ctrl-C.", markup=False)
+            out.print(f"Open {web_address(port)} in a browser; stop with Ctrl-C.", markup=False)
             ports = ["--web-viewer-port", str(port), "--port", str(port + GRPC_PORT_OFFSET)]
-            raise SystemExit(subprocess.call([*command, "--serve-web", *ports]))
+            with contextlib.suppress(KeyboardInterrupt):
+                raise SystemExit(subprocess.call([*command, "--serve-web", *ports]))
+            return
         if has_display():
             subprocess.Popen(command, start_new_session=True)
             return
