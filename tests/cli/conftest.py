@@ -15,12 +15,13 @@ from tests.cli.tiny_nuscenes import write_tiny_nuscenes
 
 @pytest.fixture(scope="session")
 def random_weights(tmp_path_factory) -> Path:
-    """A checkpoint of an untrained network whose thresholds let everything through."""
+    """A checkpoint of an untrained network whose thresholds let everything through; few queries keep it fast."""
     torch.manual_seed(7)
     config = preset("lite")
     tracking = config.tracking.model_copy(update={"tau_d": 0.001, "tau_t": 0.001, "merge": False})
     path = tmp_path_factory.mktemp("weights") / "random.safetensors"
-    save_checkpoint(path, PredMapNet(config.model_copy(update={"tracking": tracking})))
+    decoder = config.decoder.model_copy(update={"queries": 6})
+    save_checkpoint(path, PredMapNet(config.model_copy(update={"tracking": tracking, "decoder": decoder})))
     return path
 
 

@@ -18,7 +18,7 @@ SCENES = ("scene-0001", "scene-0002", "scene-0003", "scene-0004")
 
 @pytest.fixture
 def data(tmp_path) -> Path:
-    return write_tiny_nuscenes(tmp_path / "data", SCENES, frames=8)
+    return write_tiny_nuscenes(tmp_path / "data", SCENES, frames=4)
 
 
 def settings(data: Path, weights: Path) -> list[str]:
