@@ -15,6 +15,7 @@ import typer
 
 from cli.batch import batch
 from cli.console import say_error
+from cli.diff import diff
 from cli.evaluate import evaluate
 from cli.infer import infer
 from cli.scenes import scenes
@@ -37,6 +38,7 @@ app.command()(batch)
 app.command()(scenes)
 app.command()(evaluate)
 app.command()(train)
+app.command()(diff)
 
 
 def _version(wanted: bool) -> None:

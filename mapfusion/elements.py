@@ -120,6 +120,7 @@ class MapElement:
         first_seen, last_seen: integer nanoseconds.
         track_ids: ids of the tracks that were fused into it, ascending.
         deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known.
+        sources: names of the maps that it was merged from, ascending; empty for a map of one drive.
     """
 
     kind: ElementKind
@@ -130,6 +131,7 @@ class MapElement:
     last_seen: int
     track_ids: tuple[int, ...] = ()
     deviation: Float | None = None
+    sources: tuple[str, ...] = ()
 
     @property
     def length(self) -> float:

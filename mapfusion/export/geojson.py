@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import secrets
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
+from mapfusion.export.plane import LocalPlane
 
 Float = NDArray[np.float64]
 
@@ -23,8 +23,6 @@ DECIMALS = 10
 """Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-WGS84_SEMI_MAJOR_AXIS = 6_378_137.0
-WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
 
 
 class Georeference(Protocol):
@@ -108,7 +106,7 @@ def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None)
         raise ValueError(f"{path}: not a GeoJSON FeatureCollection")
     if georeference is None:
         box = document.get("bbox", [0.0, 0.0, 0.0, 0.0])
-        georeference = _LocalPlane((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+        georeference = LocalPlane((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
     elements = []
     for position, feature in enumerate(document.get("features", [])):
         try:
@@ -131,26 +129,6 @@ def parse_timestamp(text: str) -> int:
         raise ValueError(f"not a timestamp of the form 2024-01-31T12:00:00.123456789Z: {text!r}")
     moment = datetime.strptime(match[1] + "+0000", "%Y-%m-%dT%H:%M:%S%z") - EPOCH
     return (moment.days * 86_400 + moment.seconds) * 1_000_000_000 + int(match[2])
-
-
-class _LocalPlane:
-    """Metres east and north of a point, on the ellipsoid's radii of curvature there."""
-
-    name = "local plane"
-
-    def __init__(self, longitude: float, latitude: float) -> None:
-        self.origin = np.array([longitude, latitude])
-        sine = math.sin(math.radians(latitude))
-        root = math.sqrt(1.0 - WGS84_ECCENTRICITY_SQUARED * sine**2)
-        meridian = WGS84_SEMI_MAJOR_AXIS * (1.0 - WGS84_ECCENTRICITY_SQUARED) / root**3
-        parallel = WGS84_SEMI_MAJOR_AXIS / root * math.cos(math.radians(latitude))
-        self.scale = np.radians(np.array([parallel, meridian]))
-
-    def to_wgs84(self, points: Float) -> Float:
-        return np.asarray(points / self.scale + self.origin)
-
-    def from_wgs84(self, points: Float) -> Float:
-        return np.asarray((points - self.origin) * self.scale)
 
 
 def _feature(element: MapElement, georeference: Georeference) -> dict[str, Any]:
@@ -180,6 +158,8 @@ def _feature(element: MapElement, georeference: Georeference) -> dict[str, Any]:
     }
     if deviation is not None:
         properties["deviation_m"] = np.round(deviation, 3).tolist()
+    if element.sources:
+        properties["sources"] = list(element.sources)
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
@@ -200,6 +180,7 @@ def _element(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -
         last_seen=parse_timestamp(properties["last_seen"]),
         track_ids=tuple(int(track) for track in properties["track_ids"]),
         deviation=None if deviation is None else np.array(deviation, dtype=np.float64),
+        sources=tuple(map(str, properties.get("sources", ()))),
     )
 
 

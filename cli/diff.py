@@ -1,0 +1,74 @@
+"""``predmapnet diff``: what changed between two maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mapfusion.diff import MapDiff
+
+
+def diff(
+    old: Annotated[Path, typer.Argument(help="The map as it was.")],
+    new: Annotated[Path, typer.Argument(help="The map of a later drive.")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Differences to write (GeoJSON).")] = None,
+    tolerance: Annotated[float, typer.Option(min=0.05, help="What moved less is unchanged, metres.")] = 0.5,
+    align: Annotated[bool, typer.Option(help="Take out an offset between the two drives where it is certain.")] = True,
+) -> None:
+    """Say what was added, removed or moved from one map to another, and what the new drive did not see."""
+    from cli.console import err
+    from cli.console import out as screen
+    from mapfusion.diff import DiffConfig, diff_maps, write_diff
+    from mapfusion.io import read_maps
+    from predmapnet.errors import UserError
+    from predmapnet.files import check_output
+
+    if out is not None:
+        check_output(out)
+    try:
+        (before, after), plane = read_maps([old, new])
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    config = DiffConfig(tolerance=tolerance, reach=max(2.0, 2.0 * tolerance), align=align)
+    found = diff_maps(before, after, plane, config)
+    err.print(_alignment_sentence(found, align), markup=False)
+    screen.print(_table(found))
+    if out is not None:
+        write_diff(found, out, plane, {"old": old.name, "new": new.name, "tolerance_m": tolerance})
+        screen.print(f"written: {out}", markup=False)
+
+
+def _alignment_sentence(found: MapDiff, wanted: bool) -> str:
+    import numpy as np
+
+    if not wanted:
+        return "the new map is compared as it lies"
+    if found.alignment is None:
+        return "one of the maps is empty"
+    if not found.alignment.certain:
+        return f"the new map is compared as it lies, because an alignment is not certain: {found.alignment.refusal}"
+    shift = np.linalg.norm(found.alignment.shift)
+    return f"the new map was moved by {shift:.2f} m and turned by {np.degrees(found.alignment.turn):.2f} degrees first"
+
+
+def _table(found: MapDiff) -> Table:
+    from rich.table import Table
+
+    from mapfusion.diff import Change
+    from mapfusion.elements import ElementKind
+
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("")
+    for change in Change:
+        table.add_column(f"{change.value} (m)", justify="right")
+    table.add_column("median move (m)", justify="right")
+    for kind in ElementKind:
+        cells = [f"{found.metres(change, kind):.0f} ({found.count(change, kind)})" for change in Change]
+        moved = found.moved_by(kind)
+        table.add_row(kind.label, *cells, "" if moved != moved else f"{moved:.2f}")
+    return table

@@ -1,0 +1,254 @@
+"""Where one drive's map must move to lie on another's: trimmed point-to-line ICP, refused where it is not certain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapfusion.elements import ElementKind, GlobalMap
+from mapfusion.stretches import Samples, sample_lines
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """When a correction is believed.
+
+    Attributes:
+        spacing: distance between the samples of a line, metres.
+        reach: largest shift that is looked for along each axis, metres.
+        close: samples within this distance after the correction agree, metres.
+        min_overlap: shared length that it takes, metres.
+        min_agreement: share of the samples in common ground that must agree.
+        min_hold: length of line, projected across the worst direction, that must hold the correction, metres; with
+            parallel lines only, nothing holds along them.
+        max_residual: largest root mean square of the trimmed residuals, metres.
+        max_turn: largest rotation, degrees.
+        rival_ratio: another shift, at least 1.5 m away, whose agreement reaches this share of the best makes the
+            choice uncertain (lanes repeat).
+        correlation: neighbouring samples err alike; this many count as one.
+    """
+
+    spacing: float = 1.0
+    reach: float = 4.0
+    close: float = 0.75
+    min_overlap: float = 40.0
+    min_agreement: float = 0.6
+    min_hold: float = 10.0
+    max_residual: float = 0.5
+    max_turn: float = 2.0
+    rival_ratio: float = 0.9
+    correlation: float = 10.0
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The rigid motion of the plane that puts one map on another.
+
+    Attributes:
+        centre: ``(2,)``, metres; the motion is ``p -> centre + R(turn) (p - centre) + shift``.
+        shift: ``(2,)``, metres.
+        turn: radians, counter-clockwise.
+        information: ``(3, 3)`` inverse covariance of shift and turn.
+        overlap: shared length, metres.
+        residual: root mean square of the trimmed residuals, metres.
+        refusal: why it is not certain, empty if it is.
+        disagrees: whether the maps share ground and yet contradict each other there.
+    """
+
+    centre: Float
+    shift: Float
+    turn: float
+    information: Float
+    overlap: float
+    residual: float
+    refusal: str = ""
+    disagrees: bool = False
+
+    @property
+    def certain(self) -> bool:
+        """Whether the motion may be used."""
+        return not self.refusal
+
+    def apply(self, points: Float) -> Float:
+        """Move points ``(n, 2)``, metres."""
+        return move(points, self.centre, self.shift, self.turn)
+
+
+def move(points: Float, centre: Float, shift: Float, turn: float) -> Float:
+    """Turn points ``(n, 2)`` about ``centre`` by ``turn`` radians and shift them."""
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return np.asarray((points - centre) @ rotation.T + centre + shift)
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """A map as samples with directions and kinds, and a tree over each kind."""
+
+    samples: Samples
+    kinds: NDArray[np.int64]
+    trees: dict[int, tuple[NDArray[np.intp], cKDTree]]
+
+
+def landmarks(global_map: GlobalMap, config: AlignmentConfig | None = None) -> Landmarks:
+    """Sample a map for :func:`align`, so that a map that meets many others is sampled once."""
+    config = config or AlignmentConfig()
+    elements = [element for element in global_map if element.length > config.spacing]
+    samples = sample_lines([element.points for element in elements], config.spacing)
+    kinds = np.array([int(element.kind) for element in elements], dtype=np.int64)[samples.line]
+    trees = {}
+    for kind in ElementKind:
+        rows = np.flatnonzero(kinds == kind)
+        if len(rows):
+            trees[int(kind)] = (rows, cKDTree(samples.points[rows]))
+    return Landmarks(samples, kinds, trees)
+
+
+def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None = None) -> Alignment:
+    """Find the rigid motion that puts ``source`` on ``target``, and whether to believe it.
+
+    The shift is first looked for on a grid of one metre, by how many samples come to lie near a line of their kind;
+    then refined by Gauss-Newton on distances across lines, the worst fifth left out.
+
+    Args:
+        source, target: from :func:`landmarks`.
+        config: what it takes to be certain.
+    """
+    config = config or AlignmentConfig()
+    near, _, _ = _nearest(source, target, source.samples.points, config.reach + 4.0)
+    common = np.flatnonzero(near >= 0)
+    overlap = float(source.samples.spacing[common].sum())
+    if overlap < config.min_overlap:
+        return _refused(f"only {overlap:.0f} m of lines in common ground", overlap)
+    points = source.samples.points[common]
+    centre = points.mean(axis=0)
+    shift, rival = _search(source, target, common, config)
+    turn = 0.0
+    for reach in (3.0, 2.0, 1.5, 1.0, config.close, config.close, config.close):
+        step, information, residual, agreed = _step(source, target, common, centre, shift, turn, reach, config)
+        shift, turn = shift + step[:2], turn + float(step[2])
+        if reach == config.close and np.abs(step).max() < 1e-4:
+            break
+    shared = float(source.samples.spacing[common][agreed].sum())
+    result = Alignment(centre, shift, turn, information, shared, residual)
+    refusal, disagrees = _doubt(result, shared / overlap, rival, config)
+    return Alignment(centre, shift, turn, information, shared, residual, refusal, disagrees)
+
+
+def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentConfig) -> tuple[str, bool]:
+    """Say why an alignment is not to be believed, or nothing; and whether the maps contradict each other."""
+    if result.overlap < config.min_overlap:
+        return f"only {result.overlap:.0f} m of lines agree", agreement < config.min_agreement
+    if agreement < config.min_agreement:
+        return f"only {100 * agreement:.0f} % of the common ground agrees", True
+    if result.residual > config.max_residual:
+        return f"the lines still lie {result.residual:.2f} m apart", True
+    variance = result.residual**2 + 0.05**2
+    hold = np.linalg.eigvalsh(result.information[:2, :2])[0] * variance * config.correlation * config.spacing
+    if hold < config.min_hold:
+        return "nothing but parallel lines: the shift along them cannot be told", False
+    if rival > config.rival_ratio:
+        return "another shift fits as well (lines repeat)", False
+    limit = np.radians(config.max_turn)
+    if abs(result.turn) > limit or np.abs(result.shift).max() > config.reach + 1.0:
+        return f"the maps would have to move by {np.linalg.norm(result.shift):.1f} m", False
+    return "", False
+
+
+def _refused(reason: str, overlap: float) -> Alignment:
+    return Alignment(np.zeros(2), np.zeros(2), 0.0, np.zeros((3, 3)), overlap, 0.0, reason)
+
+
+def _nearest(
+    source: Landmarks, target: Landmarks, points: Float, reach: float
+) -> tuple[NDArray[np.int64], Float, Float]:
+    """Return for each point of the source, moved to ``points``, the nearest target sample of its kind.
+
+    Returns:
+        ``(n,)`` rows of the target, -1 for none or for another direction; ``(n,)`` distances across the line;
+        ``(n, 2)`` unit normals.
+    """
+    rows = np.full(len(points), -1, dtype=np.int64)
+    for kind, (members, tree) in target.trees.items():
+        own = np.flatnonzero(source.kinds == kind)
+        if len(own):
+            distance, nearest = tree.query(points[own], distance_upper_bound=reach)
+            hit = np.isfinite(distance)
+            rows[own[hit]] = members[nearest[hit]]
+    tangent = target.samples.tangents[np.maximum(rows, 0)] if len(target.samples) else np.zeros((len(points), 2))
+    rows[np.abs((source.samples.tangents * tangent).sum(axis=1)) < np.cos(np.radians(30.0))] = -1
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    base = target.samples.points[np.maximum(rows, 0)] if len(target.samples) else points
+    return rows, ((base - points) * normal).sum(axis=1), normal
+
+
+def _search(
+    source: Landmarks, target: Landmarks, common: NDArray[np.intp], config: AlignmentConfig
+) -> tuple[Float, float]:
+    """Return the shift of a grid under which most samples agree, and how good the best shift elsewhere is.
+
+    Returns:
+        ``(2,)`` metres; the agreement of the best rival at least 1.5 m away as a share of the best.
+    """
+    thin = common[:: max(1, len(common) // 150)]
+    side = np.arange(-config.reach, config.reach + 0.5)
+    shifts = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    shifts = shifts[np.argsort((shifts**2).sum(axis=1), kind="stable")]
+    moved = source.samples.points[thin][None, :, :] + shifts[:, None, :]
+    score = np.zeros(len(shifts))
+    for kind, (members, tree) in target.trees.items():
+        own = np.flatnonzero(source.kinds[thin] == kind)
+        if not len(own):
+            continue
+        distance, nearest = tree.query(moved[:, own].reshape(-1, 2), distance_upper_bound=2.0)
+        hit = np.isfinite(distance)
+        tangent = target.samples.tangents[members[np.where(hit, nearest, 0)]]
+        directions = np.tile(source.samples.tangents[thin[own]], (len(shifts), 1))
+        along = np.abs((directions * tangent).sum(axis=1)) > np.cos(np.radians(30.0))
+        value = np.where(hit & along, np.exp(-0.5 * (np.where(hit, distance, 9.0) / 0.6) ** 2), 0.0)
+        score += value.reshape(len(shifts), -1).sum(axis=1)
+    best = int(np.argmax(score))
+    elsewhere = np.linalg.norm(shifts - shifts[best], axis=1) >= 2.0
+    rival = float(score[elsewhere].max() / score[best]) if score[best] > 0 else 1.0
+    return shifts[best], rival
+
+
+def _step(
+    source: Landmarks,
+    target: Landmarks,
+    common: NDArray[np.intp],
+    centre: Float,
+    shift: Float,
+    turn: float,
+    reach: float,
+    config: AlignmentConfig,
+) -> tuple[Float, Float, float, Bool]:
+    """One trimmed Gauss-Newton step.
+
+    Returns:
+        ``(3,)`` change of shift and turn; ``(3, 3)`` information; root mean square residual, metres; ``(n,)`` which of
+        the common samples agree.
+    """
+    samples = source.samples
+    moved = move(samples.points, centre, shift, turn)
+    rows, across, normal = _nearest(source, target, moved, float(np.hypot(reach, config.spacing)))
+    rows, across, normal = rows[common], across[common], normal[common]
+    agreed = (rows >= 0) & (np.abs(across) < reach)
+    if np.count_nonzero(agreed) < 3:
+        return np.zeros(3), np.zeros((3, 3)), np.inf, agreed
+    residual = np.abs(across[agreed])
+    kept = np.flatnonzero(agreed)[residual <= np.quantile(residual, 0.8)]
+    lever = moved[common][kept] - centre - shift
+    side = np.stack([-lever[:, 1], lever[:, 0]], axis=1)
+    design = np.column_stack([normal[kept], (normal[kept] * side).sum(axis=1)])
+    normal_matrix = design.T @ design
+    # a whisper of a prior keeps the step finite where parallel lines leave a direction open
+    step = np.linalg.solve(normal_matrix + np.diag([1e-3, 1e-3, 1e-1]), design.T @ across[kept])
+    left = across[kept] - design @ step
+    rms = float(np.sqrt((left**2).mean()))
+    return step, normal_matrix / ((rms**2 + 0.05**2) * config.correlation), rms, agreed

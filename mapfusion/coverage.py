@@ -1,0 +1,58 @@
+"""Which ground a map speaks of: where nothing in the map means that nothing was there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap, MapElement
+from mapfusion.export.geojson import Georeference, InvertibleGeoreference
+
+Float = NDArray[np.float64]
+
+NEAR = 8.0
+"""Ground within this distance of an element that was found counts as looked at, metres."""
+
+CLOSING = 8.0
+"""Gaps narrower than twice this between such grounds count, too: the middle of a wide road, metres."""
+
+
+def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None) -> shapely.Geometry:
+    """Return the ground that a map speaks of, metres, in the map's frame.
+
+    A map that says so itself is believed: ``provenance["observed"]`` holds rings of longitude and latitude, as
+    ``predmapnet infer`` writes them from the drive. Otherwise it is the ground near its elements: the car passed where
+    it found something, and a detector that found the kerb would have found the crossing beside it.
+
+    Args:
+        global_map: the map.
+        plane: leads from degrees to the map's frame; without it the second way is taken.
+    """
+    observed = global_map.provenance.get("observed")
+    if observed and plane is not None:
+        rings = [shapely.Polygon(plane.from_wgs84(np.array(ring, dtype=np.float64))) for ring in observed]
+        return shapely.union_all([shapely.make_valid(ring) for ring in rings])
+    return near_elements(global_map)
+
+
+def observed_rings(ground: shapely.Geometry, georeference: Georeference) -> list[list[list[float]]]:
+    """Return ground (metres) as it is written to ``provenance["observed"]``: outer rings in degrees, holes filled."""
+    parts = [part for part in shapely.get_parts(ground) if part.geom_type == "Polygon"]
+    rings = [shapely.get_coordinates(shapely.simplify(part, 1.0).exterior) for part in parts]
+    return [np.round(georeference.to_wgs84(ring), 7).tolist() for ring in rings]
+
+
+def near_elements(elements: Iterable[MapElement]) -> shapely.Geometry:
+    """Return the ground near elements, gaps closed, metres."""
+    lines = shapely.simplify([shapely.LineString(element.points) for element in elements], 0.5)
+    grown = shapely.union_all(shapely.buffer(lines, NEAR + CLOSING, quad_segs=2))
+    return shapely.simplify(shapely.buffer(grown, -CLOSING, quad_segs=2), 0.5)
+
+
+def inside(ground: shapely.Geometry, points: Float) -> NDArray[np.bool_]:
+    """Return which of ``(n, 2)`` points lie on the ground."""
+    shapely.prepare(ground)
+    return np.asarray(shapely.contains_xy(ground, points[:, 0], points[:, 1]))

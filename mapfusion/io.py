@@ -1,0 +1,115 @@
+"""Maps to and from files; the format is chosen by the name's ending."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap
+from mapfusion.export.geojson import Georeference, InvertibleGeoreference, read_geojson, write_geojson
+from mapfusion.export.plane import LocalPlane, common_plane
+
+Float = NDArray[np.float64]
+
+SUFFIXES = {".geojson": "GeoJSON", ".json": "GeoJSON"}
+"""Endings of the files that hold maps, and what each is."""
+
+
+def check_suffix(path: Path) -> None:
+    """Raise ValueError for a name whose ending stands for no format."""
+    if path.suffix.lower() not in SUFFIXES:
+        endings = ", ".join(f"{suffix} ({name})" for suffix, name in SUFFIXES.items())
+        raise ValueError(f"{path}: the ending '{path.suffix}' stands for no map format; use one of {endings}")
+
+
+def write_map(
+    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+) -> None:
+    """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
+
+    Args:
+        global_map: elements in the metric global frame.
+        path: file to write; an existing one is replaced.
+        georeference: of that frame.
+        provenance: what else the file should tell of its origin.
+
+    Raises:
+        ValueError: an ending that stands for no format, or coordinates not on the globe.
+        OSError: the file cannot be written.
+    """
+    check_suffix(path)
+    write_geojson(global_map, path, georeference, provenance)
+
+
+def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
+    """Read a map that :func:`write_map` wrote.
+
+    Args:
+        path: the file.
+        georeference: leads to the metric frame; without one the map is in metres about the middle of its bounds.
+
+    Raises:
+        ValueError: an ending that stands for no format, or a file that is not as it should be.
+        OSError: the file cannot be read.
+    """
+    check_suffix(path)
+    return read_geojson(path, georeference)
+
+
+def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
+    """Read maps of one place into one metric plane.
+
+    Returns:
+        The maps, in the order of the paths, and the plane.
+
+    Raises:
+        ValueError, OSError: as :func:`read_map`, or the maps lie too far apart.
+    """
+    boxes = [box for box in (read_box(path) for path in paths) if box is not None]
+    plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
+    return [read_map(path, plane) for path in paths], plane
+
+
+def read_box(path: Path) -> Float | None:
+    """Return west, south, east and north of a map, degrees, without reading all of it; None if it is empty.
+
+    Raises:
+        ValueError, OSError: as :func:`read_map`.
+    """
+    check_suffix(path)
+    with path.open(encoding="utf-8") as file:
+        head = file.read(512)
+    found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
+    box = json.loads(found[1]) if found else _box_of_points(path)
+    if box is None:
+        return None
+    if len(box) != 4 or not np.isfinite(box).all():
+        raise ValueError(f"{path}: the bounding box is not four numbers: {box}")
+    return np.array(box, dtype=np.float64)
+
+
+def _box_of_points(path: Path) -> list[float] | None:
+    """The bounds of a file that does not begin with them."""
+    elements = read_map(path, _Degrees()).elements
+    if not elements:
+        return None
+    points = np.concatenate([element.points for element in elements])
+    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+
+
+class _Degrees:
+    """Leaves longitude and latitude as they are."""
+
+    name = "degrees"
+
+    def to_wgs84(self, points: Float) -> Float:
+        return points
+
+    def from_wgs84(self, points: Float) -> Float:
+        return points
