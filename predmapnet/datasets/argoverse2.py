@@ -3,53 +3,47 @@
 from __future__ import annotations
 
 import difflib
-import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 from numpy.typing import NDArray
-from pyarrow import ArrowInvalid, feather
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
+from predmapnet.datasets.argoverse2_files import (
+    CAMERAS,
+    POSES,
+    city,
+    every_sweep,
+    find_logs,
+    read_table,
+    rows_by_sensor,
+    timed_files,
+)
+from predmapnet.datasets.argoverse2_frames import (
+    IMAGE_TOLERANCE,
+    strided_over_logs,
+    strided_over_time,
+    sweeps_with_images,
+)
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.poses import pose_matrix
-from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
-from predmapnet.datasets.splits import SPLITS, check_split, split_names
+from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
+from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
 
-CAMERAS = (
-    "ring_front_center",
-    "ring_front_right",
-    "ring_front_left",
-    "ring_rear_right",
-    "ring_rear_left",
-    "ring_side_right",
-    "ring_side_left",
-)
 KEY_FRAME_STRIDE = 4
 """Every fourth lidar sweep of 10 Hz is a key frame (2.5 Hz), as in the official vector-map data sets."""
-IMAGE_TOLERANCE = 25_000_000
-"""An image belongs to a sweep if it lies within half the cameras' shutter interval, nanoseconds."""
-POSES = "city_SE3_egovehicle.feather"
-SWEEP_LIST = "lidar_timestamps_ns.json"
-
-
-def find_logs(root: Path) -> dict[str, Path]:
-    """Return log folders by log id: ``root`` itself, its children, or those of its train, val and test folders."""
-    if (root / POSES).is_file():
-        return {root.name: root}
-    patterns = [f"*/{POSES}", *(f"{split}/*/{POSES}" for split in SPLITS)]
-    return {path.parent.name: path.parent for pattern in patterns for path in sorted(root.glob(pattern))}
+OLD_TRAIN_LOGS = 700
+"""Logs in the train folder of the whole data set."""
 
 
 class Argoverse2Source:
@@ -60,27 +54,40 @@ class Argoverse2Source:
         root: a log, or a folder of logs, or a folder with train, val and test folders of logs.
         synthetic: False.
         stride: every how manieth lidar sweep is a frame.
+        split_scheme: ``old`` or ``new``.
+        official_frames: whether frames are counted across logs.
     """
 
     name = "argoverse2"
     synthetic = False
 
-    def __init__(self, root: Path, stride: int = KEY_FRAME_STRIDE, split_scheme: str = "official") -> None:
+    def __init__(
+        self,
+        root: Path,
+        stride: int = KEY_FRAME_STRIDE,
+        split_scheme: str = "old",
+        official_frames: bool = False,
+    ) -> None:
         """Find the logs; nothing is read yet.
 
         Args:
             root: see above.
             stride: every how manieth lidar sweep of 10 Hz is a frame.
-            split_scheme: ``official`` (the folder that a log lies in) or ``disjoint`` (StreamMapNet's).
+            split_scheme: ``old`` (the folder that a log lies in) or ``new`` (StreamMapNet's).
+            official_frames: False counts the sweeps of each log from 0, so that a log's frames depend on nothing else.
+                True takes exactly the frames of the published benchmarks: sweeps without all images are dropped,
+                and the rest is counted across all logs of a split (:mod:`predmapnet.datasets.argoverse2_frames`).
+                That needs the images of every log of the split.
 
         Raises:
-            UserError: no logs there.
+            UserError: no logs there, or no such scheme.
         """
         self.root = Path(root)
         self.stride = stride
-        if split_scheme not in ("official", "disjoint"):
-            raise UserError(f"There is no Argoverse 2 split '{split_scheme}'; there are: official, disjoint.")
+        check_scheme(split_scheme)
         self.split_scheme = split_scheme
+        self.official_frames = official_frames
+        self._frames_of_split: dict[str, dict[str, Integer]] = {}
         if not self.root.is_dir():
             raise UserError(f"The Argoverse 2 folder {self.root} does not exist.")
         self._logs = find_logs(self.root)
@@ -91,23 +98,67 @@ class Argoverse2Source:
             )
 
     @cached_property
-    def _disjoint_split(self) -> dict[str, str]:
+    def _new_split(self) -> dict[str, str]:
         return {log: split for split in ("train", "val") for log in split_names(f"argoverse2_new_{split}")}
 
     def _split(self, log: str) -> str | None:
-        if self.split_scheme == "disjoint":
-            return self._disjoint_split.get(log)
+        if self.split_scheme == "new":
+            return self._new_split.get(log)
         folder = self._logs[log].parent.name
         return folder if folder in SPLITS else "test"
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
-        """List the logs, sorted by folder and id; with the official split, a log outside train and val is ``test``.
+        """List the logs, sorted by folder and id; with the old split, a log outside train and val is ``test``.
 
-        With the disjoint split, logs that it does not name are left out.
+        With the new split, logs that it does not name are left out; so are logs without any official frame, if those
+        were asked for.
         """
-        check_split(split)
-        infos = [self._info(log) for log in self._logs if self._split(log) is not None]
-        return tuple(info for info in infos if split in (None, info.split))
+        check_split(split, self.split_scheme)
+        splits = {log: self._split(log) for log in self._logs}
+        if not any(splits.values()):
+            raise UserError(f"The new split names none of the {len(self._logs)} logs in {self.root}.")
+        infos = [self._info(log) for log, of in splits.items() if of is not None and split in (None, of)]
+        return tuple(info for info in infos if info.frames or not self.official_frames)
+
+    def _key_frames(self, log: str) -> Integer:
+        """Time stamps of a log's frames, ascending."""
+        if not self.official_frames:
+            return every_sweep(self._logs[log])[:: self.stride]
+        split = self._split(log)
+        if split is None:
+            raise UserError(f"{log} is not in the new split, so it has no official frames.")
+        if split not in self._frames_of_split:
+            self._frames_of_split[split] = self._official_frames(split)
+        return self._frames_of_split[split].get(log, np.zeros(0, dtype=np.int64))
+
+    def _official_frames(self, split: str) -> dict[str, Integer]:
+        """Frames of all logs of a split as the published benchmarks count them; UserError if any log is missing."""
+        if self.split_scheme == "new":
+            logs = split_names(f"argoverse2_new_{split}")
+            missing = [log for log in logs if log not in self._logs]
+            lacking = f"{len(missing)} of {len(logs)} logs, {missing[0]} for one" if missing else ""
+        elif split == "train":
+            logs = tuple(log for log in self._logs if self._split(log) == split)
+            lacking = f"{OLD_TRAIN_LOGS - len(logs)} of {OLD_TRAIN_LOGS} logs" if len(logs) < OLD_TRAIN_LOGS else ""
+        else:
+            raise UserError(
+                f"There is no rule for the official frames of the old {split} split: the published code reads them "
+                "from a file of its own. Use the new split, or count the frames of each log by itself."
+            )
+        if lacking:
+            raise UserError(
+                f"The official frames of the {self.split_scheme} {split} split are counted across all its logs, but "
+                f"{self.root} lacks {lacking}. Fetch them, or count the frames of each log by itself."
+            )
+        kept = [log for log in logs if log not in split_names("argoverse2_skipped")]
+        sweeps = {log: sweeps_with_images(every_sweep(self._logs[log]), self._image_times(log)) for log in kept}
+        return (strided_over_logs if self.split_scheme == "new" else strided_over_time)(sweeps, self.stride)
+
+    def _image_times(self, log: str) -> list[Integer]:
+        cameras = self._logs[log] / "sensors" / "cameras"
+        if not cameras.is_dir():
+            raise UserError(f"{self._logs[log]} has no images, but the official frames are those with all images.")
+        return [timed_files(cameras / name, ".jpg")[0] for name in CAMERAS]
 
     def _info(self, log: str) -> SceneInfo:
         folder = self._logs[log]
@@ -116,8 +167,8 @@ class Argoverse2Source:
         return SceneInfo(
             name=log,
             split=self._split(log) or "test",
-            frames=len(_key_frames(folder, self.stride)),
-            location=_city(folder),
+            frames=len(self._key_frames(log)),
+            location=city(folder),
             ready=has_images,
             description=("" if has_images else "no images: ground truth only")
             or ("left out of the published training sets" if left_out else ""),
@@ -130,7 +181,20 @@ class Argoverse2Source:
             near = matches[:4] or difflib.get_close_matches(scene, list(self._logs), n=4, cutoff=0.3)
             hint = f" Did you mean {', '.join(near)}?" if near else ""
             raise UserError(f"{self.root} holds no log '{scene}' among its {len(self._logs)} logs.{hint}")
-        return Argoverse2Scene(self._logs[matches[0]], self._info(matches[0]), self.stride)
+        return Argoverse2Scene(self._logs[matches[0]], self._info(matches[0]), self._key_frames(matches[0]))
+
+    def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
+        """Look up which logs frames belong to; unknown tokens are absent.
+
+        Args:
+            tokens: ``<log>_<timestamp>`` as MapTRv2 and this package name frames, or the time stamp alone as
+                StreamMapNet and MapTracker do.
+        """
+        known: dict[str, str] = {}
+        for info in self.scenes():
+            for time in self._key_frames(info.name).tolist():
+                known[f"{info.name}_{time}"] = known[str(time)] = info.name
+        return {token: known[token] for token in tokens if token in known}
 
 
 class Argoverse2Scene:
@@ -144,20 +208,25 @@ class Argoverse2Scene:
 
     georeference: Georeference | None
 
-    def __init__(self, folder: Path, info: SceneInfo, stride: int) -> None:
+    def __init__(self, folder: Path, info: SceneInfo, timestamps: Integer) -> None:
         """Read the poses; calibration, images and the map are read when they are asked for.
+
+        Args:
+            folder: of the log.
+            info: the log's line in the listing.
+            timestamps: ``(n,)`` of the sweeps that are frames, nanoseconds.
 
         Raises:
             UserError: poses are missing or damaged.
         """
         self.info = info
         self.georeference = argoverse2_georeference(info.location)
-        self.timestamps = _key_frames(folder, stride)
+        self.timestamps = timestamps
         self._folder = folder
-        self._poses = _read_table(folder / POSES)
+        self._poses = read_table(folder / POSES)
         self._pose_rows = {int(time): row for row, time in enumerate(self._poses["timestamp_ns"])}
         if len(self.timestamps) == 0:
-            raise UserError(f"{folder} names no lidar sweep and no image, so it has no frames.")
+            raise UserError(f"{folder} names no lidar sweep and no image that is a frame, so it has none.")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -171,8 +240,8 @@ class Argoverse2Scene:
                 f"{self._folder} has no calibration folder, so its cameras are unknown: it can serve ground truth, but "
                 "it cannot be mapped. Fetch the log's calibration/*.feather."
             )
-        intrinsics = _rows_by_sensor(calibration / "intrinsics.feather")
-        mounting = _rows_by_sensor(calibration / "egovehicle_SE3_sensor.feather")
+        intrinsics = rows_by_sensor(calibration / "intrinsics.feather")
+        mounting = rows_by_sensor(calibration / "egovehicle_SE3_sensor.feather")
         missing = [name for name in CAMERAS if name not in intrinsics or name not in mounting]
         if missing:
             raise UserError(f"{calibration} does not describe the cameras {', '.join(missing)}.")
@@ -187,7 +256,7 @@ class Argoverse2Scene:
                 f"{self._folder} has no images (looked for sensors/cameras/ring_*/<timestamp>.jpg): it can serve "
                 "ground truth, but it cannot be mapped. Fetch the log's camera images."
             )
-        return {name: _timed_files(folder / name, ".jpg") for name in CAMERAS}
+        return {name: timed_files(folder / name, ".jpg") for name in CAMERAS}
 
     def frame(self, index: int) -> Frame:
         """Return frame ``index``: pose at exactly the sweep's time stamp, nearest image of each camera within 25 ms.
@@ -196,18 +265,23 @@ class Argoverse2Scene:
             IndexError: no such frame.
             UserError: no calibration, no images, or a pose is missing or broken.
         """
-        ego_to_global = self.pose(index)
-        timestamp = int(self.timestamps[index])
-        images = {name: _nearest(*self._images[name], timestamp) for name in CAMERAS}
+        instant = self.instant(index)
+        images = {name: _nearest(*self._images[name], instant.timestamp) for name in CAMERAS}
         return Frame(
             scene=self.info.name,
             index=index,
-            token=f"{self.info.name}_{timestamp}",
-            timestamp=timestamp,
-            ego_to_global=ego_to_global,
+            token=instant.token,
+            timestamp=instant.timestamp,
+            ego_to_global=instant.ego_to_global,
             rig=self.rig,
             images={name: path for name, path in images.items() if path is not None},
         )
+
+    def instant(self, index: int) -> Instant:
+        """Return token, time stamp and pose of frame ``index``; works without images and calibration."""
+        pose = self.pose(index)
+        timestamp = int(self.timestamps[index])
+        return Instant(f"{self.info.name}_{timestamp}", timestamp, pose)
 
     def pose(self, index: int) -> Float:
         """Return ``ego_to_global`` of frame ``index``, ``(4, 4) float64``; works without images and calibration."""
@@ -249,37 +323,11 @@ class Argoverse2Scene:
         return truth_map(self.ground_truth, frames, RegionOfInterest())
 
 
-def _key_frames(folder: Path, stride: int) -> Integer:
-    """Time stamps of every ``stride``-th lidar sweep; without lidar files, of front images at the sweeps' rate."""
-    sweeps, _ = _timed_files(folder / "sensors" / "lidar", ".feather")
-    if len(sweeps) == 0 and (folder / SWEEP_LIST).is_file():
-        sweeps = np.sort(np.array(_read_json(folder / SWEEP_LIST), dtype=np.int64))
-    if len(sweeps):
-        return sweeps[::stride]
-    # The front camera runs at twice the lidar's rate.
-    images, _ = _timed_files(folder / "sensors" / "cameras" / CAMERAS[0], ".jpg")
-    return images[:: 2 * stride]
-
-
-def _timed_files(folder: Path, suffix: str) -> tuple[Integer, list[Path]]:
-    files = sorted((int(path.stem), path) for path in folder.glob(f"*{suffix}") if path.stem.isdigit())
-    return np.array([time for time, _ in files], dtype=np.int64), [path for _, path in files]
-
-
 def _nearest(times: Integer, files: Sequence[Path], timestamp: int) -> Path | None:
     if len(times) == 0:
         return None
     nearest = int(np.argmin(np.abs(times - timestamp)))
     return files[nearest] if abs(int(times[nearest]) - timestamp) <= IMAGE_TOLERANCE else None
-
-
-def _city(folder: Path) -> str:
-    """Three-letter city of a log, from the name of its map file (``..._PIT_city_47896.json``)."""
-    for path in sorted((folder / "map").glob("log_map_archive_*.json")):
-        found = re.search(r"_([A-Z]{3})_city_", path.name)
-        if found:
-            return found.group(1)
-    return "unknown"
 
 
 def _camera(name: str, intrinsics: dict[str, Any], mounting: dict[str, Any], folder: Path) -> Camera:
@@ -296,28 +344,3 @@ def _camera(name: str, intrinsics: dict[str, Any], mounting: dict[str, Any], fol
             f"{folder / 'egovehicle_SE3_sensor.feather'}, {name}",
         ),
     )
-
-
-def _rows_by_sensor(path: Path) -> dict[str, dict[str, Any]]:
-    table = _read_table(path)
-    return {
-        str(name): {column: values[row] for column, values in table.items()}
-        for row, name in enumerate(table["sensor_name"])
-    }
-
-
-def _read_table(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        table = feather.read_table(path)
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist. The log is incomplete: fetch it again.") from None
-    except (ArrowInvalid, OSError) as error:
-        raise UserError(f"{path} is not a readable feather file ({error}). Fetch it again.") from None
-    return {name: table.column(name).to_numpy() for name in table.column_names}
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return orjson.loads(path.read_bytes())
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{path} is not valid JSON ({error}). Fetch it again.") from None

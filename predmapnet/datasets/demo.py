@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
 from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
@@ -49,3 +50,12 @@ class DemoSource:
             )
         written.info = dataclasses.replace(info, ready=True)
         return written
+
+    def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
+        """Look up which scenes frames belong to, among those that have been rendered; unknown tokens are absent."""
+        wanted = set(tokens)
+        found: dict[str, str] = {}
+        for info in self.scenes():
+            if info.ready and len(found) < len(wanted):
+                found |= NuScenesSource(scene_folder(info.name, self.root)).scenes_of(wanted - found.keys())
+        return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,20 +20,16 @@ from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
 from predmapnet.datasets.poses import pose_matrix
-from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Progress, Rig, SceneInfo
-from predmapnet.datasets.splits import check_split, split_names
+from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
+from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 
 CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
-SPLIT_LISTS = {
-    "official": {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"},
-    "mini": {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"},
-    "disjoint": {"train": "nuscenes_new_train", "val": "nuscenes_new_val"},
-}
-
-
+OLD_SPLIT = {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"}
+OLD_MINI_SPLIT = {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"}
+NEW_SPLIT = {"train": "nuscenes_new_train", "val": "nuscenes_new_val"}
 DEMO_MARKER = "demo_world.json"
 """A data set with this file in its root was rendered by the demo world."""
 LEFT_OUT = "left out of the published training sets"
@@ -78,46 +74,49 @@ class NuScenesSource:
         root: folder with ``v1.0-*``, ``samples`` and ``maps``.
         version: name of the table folder that is read.
         synthetic: whether its images were rendered, as the demo world's marker file says.
+        split_scheme: ``old`` or ``new``.
     """
 
     name = "nuscenes"
 
-    def __init__(self, root: Path, version: str | None = None, split_scheme: str | None = None) -> None:
+    def __init__(self, root: Path, version: str | None = None, split_scheme: str = "old") -> None:
         """Find the tables; nothing is read yet.
 
         Args:
             root: folder with ``v1.0-*``, ``samples`` and ``maps``.
             version: table folder; None takes v1.0-trainval if it is there, v1.0-mini only if nothing else is.
-            split_scheme: ``official`` (of the data set), ``disjoint`` (StreamMapNet's geographically disjoint
-                one) or ``mini``; None takes the version's own official one.
+            split_scheme: ``old`` (the data set's own; v1.0-mini has one of its own) or ``new`` (StreamMapNet's
+                geographically disjoint one).
 
         Raises:
-            UserError: nothing to open.
+            UserError: nothing to open, or no such scheme.
         """
         self.root = Path(root)
         self.synthetic = (self.root / DEMO_MARKER).is_file()
         self.version = choose_version(self.root, version)
-        if split_scheme is None:
-            split_scheme = "mini" if self.version == "v1.0-mini" else "official"
-        if split_scheme not in SPLIT_LISTS:
-            raise UserError(f"There is no nuScenes split '{split_scheme}'; there are: {', '.join(SPLIT_LISTS)}.")
+        check_scheme(split_scheme)
         self.split_scheme = split_scheme
         self.tables = Tables(self.root / self.version)
         self._maps: dict[str, NuScenesGroundTruth | None] = {}
 
     @cached_property
     def _split_of(self) -> dict[str, str]:
-        lists = SPLIT_LISTS[self.split_scheme]
+        old = OLD_MINI_SPLIT if self.version == "v1.0-mini" else OLD_SPLIT
+        lists = NEW_SPLIT if self.split_scheme == "new" else old
         return {scene: split for split, name in lists.items() for scene in split_names(name)}
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List the scenes in the order of ``scene.json``.
 
-        Scenes that no split list names (one's own logs in this schema) are given as ``test``; with the disjoint
-        split, the four scenes that it leaves out are left out.
+        Scenes that no split list names (one's own logs in this schema) are given as ``test``; with the new split
+        they are left out, like the four scenes of nuScenes that it leaves out.
         """
-        check_split(split)
-        names = [name for name in self.tables.scenes if self.split_scheme != "disjoint" or name in self._split_of]
+        check_split(split, self.split_scheme)
+        names = [name for name in self.tables.scenes if self.split_scheme == "old" or name in self._split_of]
+        if not names and self.tables.scenes:
+            raise UserError(
+                f"The new split names none of the {len(self.tables.scenes)} scenes in {self.tables.folder}."
+            )
         infos = tuple(self._info(name) for name in names)
         return infos if split is None else tuple(info for info in infos if info.split == split)
 
@@ -144,6 +143,16 @@ class NuScenesSource:
             )
         info = self._info(scene)
         return NuScenesScene(self.root, self.tables, info, self._ground_truth(info.location), self._georeference(info))
+
+    def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
+        """Look up which scenes frames belong to, by sample token; unknown tokens are absent."""
+        names = {record["token"]: name for name, record in self.tables.scenes.items()}
+        samples = ((token, self.tables.samples.get(token)) for token in tokens)
+        return {
+            token: names[sample["scene_token"]]
+            for token, sample in samples
+            if sample is not None and sample["scene_token"] in names
+        }
 
     def _georeference(self, info: SceneInfo) -> Georeference | None:
         """Where the map lies; rendered towns carry a borrowed location and belong into the ocean."""
@@ -259,11 +268,8 @@ class NuScenesScene:
     def _calibration(self, record: Record) -> Record:
         return self._tables.calibrations[record["calibrated_sensor_token"]]
 
-    def frame(self, index: int) -> Frame:
-        """Return frame ``index`` (the official convention: ego axes, origin at the lidar's x, y).
-
-        The cameras' own time stamps are not used: like the official data sets, all calibrations are read as if
-        taken at the lidar's instant.
+    def instant(self, index: int) -> Instant:
+        """Return token, time stamp and pose of frame ``index``, as :meth:`frame` does.
 
         Raises:
             IndexError: no such frame.
@@ -274,7 +280,20 @@ class NuScenesScene:
         ego_to_global, lidar_to_ego = self._poses(index)
         shifted_to_global = ego_to_global.copy()
         shifted_to_global[:2, 3] = (ego_to_global @ lidar_to_ego)[:2, 3]
-        ego_to_shifted = inverse_pose(shifted_to_global) @ ego_to_global
+        return Instant(self._frames[index].token, self._frames[index].timestamp, shifted_to_global)
+
+    def frame(self, index: int) -> Frame:
+        """Return frame ``index`` (the official convention: ego axes, origin at the lidar's x, y).
+
+        The cameras' own time stamps are not used: like the official data sets, all calibrations are read as if
+        taken at the lidar's instant.
+
+        Raises:
+            IndexError: no such frame.
+            UserError: a pose is missing, not finite or not rigid.
+        """
+        instant = self.instant(index)
+        ego_to_shifted = inverse_pose(instant.ego_to_global) @ self._poses(index)[0]
         frame = self._frames[index]
         images = {
             channel: self._root / frame.sensors[channel]["filename"] for channel in CAMERAS if channel in frame.sensors
@@ -282,9 +301,9 @@ class NuScenesScene:
         return Frame(
             scene=self.info.name,
             index=index,
-            token=frame.token,
-            timestamp=frame.timestamp,
-            ego_to_global=shifted_to_global,
+            token=instant.token,
+            timestamp=instant.timestamp,
+            ego_to_global=instant.ego_to_global,
             rig=tuple(
                 self._camera(channel, frame.sensors.get(channel, first), ego_to_shifted, index)
                 for channel, first in self._cameras.items()

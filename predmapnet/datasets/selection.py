@@ -12,22 +12,32 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from predmapnet.datasets.argoverse2 import Argoverse2Source, find_logs
+from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.argoverse2_files import find_logs
 from predmapnet.datasets.demo import DemoSource
 from predmapnet.datasets.nuscenes import NuScenesSource, find_versions
 from predmapnet.datasets.source import SceneSource
+from predmapnet.datasets.splits import check_scheme
 from predmapnet.errors import UserError
 
 DATASETS = ("nuscenes", "argoverse2", "demo")
 ROOT_VARIABLES = {"nuscenes": "NUSCENES_ROOT", "argoverse2": "AV2_ROOT"}
 
 
-def open_source(dataset: str | None = None, data_root: Path | None = None) -> tuple[SceneSource, str]:
+def open_source(
+    dataset: str | None = None,
+    data_root: Path | None = None,
+    split_scheme: str = "old",
+    official_frames: bool = False,
+) -> tuple[SceneSource, str]:
     """Open the data set that was asked for.
 
     Args:
         dataset: ``nuscenes``, ``argoverse2`` or ``demo``; None asks the environment, then the folder itself.
         data_root: folder of the data set (for the demo world: its cache); None asks the environment.
+        split_scheme: ``old`` (the data set's own splits) or ``new`` (StreamMapNet's geographically disjoint ones).
+        official_frames: of Argoverse 2, take exactly the frames of the published benchmarks instead of counting the
+            sweeps of each log from 0. nuScenes has only one kind of frames.
 
     Returns:
         The source, and one plain sentence that says which data set it is and why.
@@ -35,6 +45,20 @@ def open_source(dataset: str | None = None, data_root: Path | None = None) -> tu
     Raises:
         UserError: what was asked for is missing or broken; there is no silent fallback.
     """
+    check_scheme(split_scheme)
+    source, sentence = _open(dataset, data_root, split_scheme, official_frames)
+    if isinstance(source, DemoSource) and split_scheme == "new":
+        raise UserError("The demo world has no new split: each of its scenes has a town of its own anyway.")
+    if official_frames and not isinstance(source, Argoverse2Source):
+        raise UserError(f"Official frames are a matter of Argoverse 2; {source.name} has only one kind of frames.")
+    if split_scheme == "new":
+        sentence += " Splits are the new, geographically disjoint ones."
+    return source, sentence
+
+
+def _open(
+    dataset: str | None, data_root: Path | None, split_scheme: str, official_frames: bool
+) -> tuple[SceneSource, str]:
     dataset, dataset_from = _setting(dataset, "--dataset", "PREDMAPNET_DATASET")
     root_text, root_from = _setting(data_root, "--data-root", "PREDMAPNET_DATA_ROOT")
     if dataset is not None and dataset not in DATASETS:
@@ -55,7 +79,11 @@ def open_source(dataset: str | None = None, data_root: Path | None = None) -> tu
     if not root.exists():
         raise UserError(f"{root_from} says the data lie in {root}, but that folder does not exist.")
     kind = dataset or _guess(root, root_from)
-    opened: SceneSource = NuScenesSource(root) if kind == "nuscenes" else Argoverse2Source(root)
+    opened: SceneSource
+    if kind == "nuscenes":
+        opened = NuScenesSource(root, split_scheme=split_scheme)
+    else:
+        opened = Argoverse2Source(root, split_scheme=split_scheme, official_frames=official_frames)
     why = f"as {dataset_from} and {root_from} say" if dataset else f"recognised in the folder that {root_from} names"
     version = f" {opened.version}" if isinstance(opened, NuScenesSource) else ""
     return opened, f"Using {kind}{version} in {root}, {why}."

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -64,6 +64,21 @@ class Frame:
     ego_to_global: Float
     rig: Rig
     images: Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Instant:
+    """When and where a frame was taken; known without calibration and images.
+
+    Attributes:
+        token: the data set's own unique name of the frame.
+        timestamp: integer nanoseconds.
+        ego_to_global: ``(4, 4) float64``, as in :class:`Frame`.
+    """
+
+    token: str
+    timestamp: int
+    ego_to_global: Float
 
 
 @dataclass(frozen=True)
@@ -140,8 +155,16 @@ class Scene(Protocol):
         """Return frame ``index``; images are named, not read. Raises UserError for a broken pose."""
         ...
 
+    def instant(self, index: int) -> Instant:
+        """Return token, time stamp and pose of frame ``index``. Raises UserError for a broken pose."""
+        ...
+
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the ground truth of frame ``index``, or None where the source has no map."""
+        ...
+
+    def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
+        """Return the ground truth of all frames, kept in the folder ``cache`` if one is given; None without a map."""
         ...
 
     def truth_map(self) -> GlobalMap | None:
@@ -173,4 +196,8 @@ class SceneSource(Protocol):
 
     def open(self, scene: str, progress: Progress | None = None) -> Scene:
         """Open one scene by name; a name that does not exist raises UserError with the nearest names."""
+        ...
+
+    def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
+        """Look up which scenes frames belong to: names of scenes by frame token. Unknown tokens are absent."""
         ...

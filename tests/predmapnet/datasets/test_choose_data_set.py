@@ -61,3 +61,31 @@ def test_a_folder_that_is_neither(tmp_path):
         open_source(None, tmp_path)
     with pytest.raises(UserError, match="holds no nuScenes tables"):
         open_source("nuscenes", tmp_path)
+
+
+def test_the_new_split_is_chosen_and_said(nuscenes_root):
+    source, why = open_source(None, nuscenes_root, split_scheme="new")
+    assert source.split_scheme == "new"
+    assert why.endswith("Splits are the new, geographically disjoint ones.")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"split_scheme": "disjoint"}, "no split scheme 'disjoint'. There are: old .* and new"),
+        ({"split_scheme": "new"}, "demo world has no new split"),
+        ({"official_frames": True}, "Official frames are a matter of Argoverse 2"),
+    ],
+)
+def test_a_choice_that_does_not_fit_the_data_set_is_an_error(arguments, said):
+    with pytest.raises(UserError, match=said):
+        open_source("demo", None, **arguments)
+
+
+def test_the_new_split_has_no_test_and_names_no_logs_of_ones_own(write_nuscenes_data, tmp_path):
+    write_nuscenes_data(tmp_path, scenes=("my-drive",), frames=1)
+    source, _ = open_source("nuscenes", tmp_path, split_scheme="new")
+    with pytest.raises(UserError, match="no test"):
+        source.scenes("test")
+    with pytest.raises(UserError, match="names none of the 1 scenes"):
+        source.scenes()

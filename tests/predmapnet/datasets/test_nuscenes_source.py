@@ -39,10 +39,10 @@ def test_published_split_sizes():
     assert (len(split_names("argoverse2_new_train")), len(split_names("argoverse2_new_val"))) == (749, 149)
 
 
-def test_the_disjoint_split_moves_scenes(write_nuscenes_data, tmp_path):
+def test_the_new_split_moves_scenes(write_nuscenes_data, tmp_path):
     write_nuscenes_data(tmp_path, "v1.0-trainval", ("scene-0001", "scene-0003", "scene-0410"), frames=1)
     official = {info.name: info.split for info in NuScenesSource(tmp_path).scenes()}
-    disjoint = {info.name: info.split for info in NuScenesSource(tmp_path, split_scheme="disjoint").scenes()}
+    disjoint = {info.name: info.split for info in NuScenesSource(tmp_path, split_scheme="new").scenes()}
     assert official == {"scene-0001": "train", "scene-0003": "val", "scene-0410": "train"}
     assert disjoint == {"scene-0001": "val", "scene-0003": "train"}
 

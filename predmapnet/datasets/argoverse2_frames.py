@@ -1,0 +1,75 @@
+"""Which lidar sweeps of Argoverse 2 the published vector-map benchmarks take as frames.
+
+They keep every fourth sweep of 10 Hz, but count across logs, so a log's first frame depends on all logs before it.
+These rules need whole splits; a single log is read by the simple rule (its sweeps 0, 4, 8, ...) unless asked otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+Integer = NDArray[np.int64]
+
+IMAGE_TOLERANCE = 25_000_000
+"""An image belongs to a sweep if it lies within half the cameras' shutter interval, nanoseconds."""
+
+
+def sweeps_with_images(sweeps: Integer, images: Iterable[Integer]) -> Integer:
+    """Drop the sweeps for which a camera has no image within 25 ms.
+
+    Args:
+        sweeps: ``(n,)`` time stamps, nanoseconds.
+        images: per camera ``(k,)`` ascending time stamps of its images.
+
+    Returns:
+        ``(m,)`` the time stamps that are kept, in order.
+    """
+    kept = np.ones(len(sweeps), dtype=bool)
+    for times in images:
+        if len(times) == 0:
+            return sweeps[:0]
+        after = np.searchsorted(times, sweeps)
+        later, earlier = times[after.clip(max=len(times) - 1)], times[(after - 1).clip(min=0)]
+        nearest = np.minimum(np.abs(later - sweeps), np.abs(earlier - sweeps))
+        kept &= nearest <= IMAGE_TOLERANCE
+    return sweeps[kept]
+
+
+def strided_over_logs(sweeps: Mapping[str, Integer], stride: int) -> dict[str, Integer]:
+    """Take every ``stride``-th sweep of all logs one after the other: the rule of the new split.
+
+    Args:
+        sweeps: ascending time stamps by log, logs in the order of the split list.
+        stride: for example 4.
+
+    Returns:
+        Time stamps of the frames by log, in the same order; a short log may have none.
+    """
+    frames = {}
+    before = 0
+    for log, times in sweeps.items():
+        frames[log] = times[-before % stride :: stride]
+        before += len(times)
+    return frames
+
+
+def strided_over_time(sweeps: Mapping[str, Integer], stride: int) -> dict[str, Integer]:
+    """Take every ``stride``-th sweep of all logs sorted together by time: the rule of the old training split.
+
+    Logs that were recorded at the same time interleave, so that steps inside a log may be uneven.
+
+    Args:
+        sweeps: time stamps by log.
+        stride: for example 4.
+
+    Returns:
+        Ascending time stamps of the frames by log, logs in the order in which they first appear.
+    """
+    logs = list(sweeps)
+    times = np.concatenate([np.zeros(0, dtype=np.int64), *sweeps.values()])
+    owners = np.repeat(np.arange(len(logs)), [len(sweeps[log]) for log in logs])
+    order = np.argsort(times, kind="stable")[::stride]
+    return {logs[owner]: times[order[owners[order] == owner]] for owner in dict.fromkeys(owners[order].tolist())}
