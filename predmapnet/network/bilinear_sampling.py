@@ -1,0 +1,58 @@
+"""Weighted sums of bilinear samples: what deformable convolutions and deformable attention are made of.
+
+A sample is the weighted sum of four rows of a table of pixels. An embedding bag adds up all samples that one result
+needs in one pass over the table, without an intermediate per sample; on a CPU that is about twice as fast as
+``grid_sample``.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def bilinear_corners(x: Tensor, y: Tensor, width: Tensor | int, height: Tensor | int) -> tuple[Tensor, Tensor]:
+    """Find the four pixels around each position, and their shares.
+
+    Args:
+        x: ``(...)``, in pixels; 0 is the centre of the first pixel.
+        y: ``(...)``.
+        width: of the map; a tensor that broadcasts against ``x`` where there are several maps.
+        height: of the map.
+
+    Returns:
+        Flat indices ``(..., 4) int32`` into the map, row by row, and weights ``(..., 4)``; pixels outside the map
+        have weight zero (and the index of a pixel inside).
+    """
+    columns, column_weights = _neighbours(x, width)
+    rows, row_weights = _neighbours(y, height)
+    stride = width[..., None, None] if isinstance(width, Tensor) else width
+    indices = rows[..., :, None] * stride + columns[..., None, :]
+    weights = row_weights[..., :, None] * column_weights[..., None, :]
+    return indices.flatten(-2), weights.flatten(-2)
+
+
+def _neighbours(position: Tensor, size: Tensor | int) -> tuple[Tensor, Tensor]:
+    """Return the two neighbours ``(..., 2) int32`` of each position on a line of pixels, and their shares."""
+    first = position.floor()
+    fraction = position - first
+    both = torch.stack([first, first + 1], dim=-1)
+    last = size[..., None] - 1 if isinstance(size, Tensor) else torch.full_like(both[..., :1], size - 1)
+    clamped = both.clamp(min=0).minimum(last)
+    shares = torch.stack([1 - fraction, fraction], dim=-1)
+    return clamped.int(), shares * (both == clamped)
+
+
+def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
+    """Add up rows of a table.
+
+    Args:
+        table: ``(rows, C)``.
+        indices: ``(results, n) int``.
+        weights: ``(results, n)``.
+
+    Returns:
+        ``(results, C)``.
+    """
+    return F.embedding_bag(indices, table, per_sample_weights=weights.to(table.dtype), mode="sum")

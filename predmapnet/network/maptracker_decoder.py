@@ -1,0 +1,217 @@
+"""MapTracker's decoder: queries of tracks and detections become polylines over six layers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.network.bevformer import ResidualPerceptron
+from predmapnet.network.deformable_attention import deformable_attention
+from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.vector_memory import Recalled
+
+
+@dataclass
+class DecoderRows:
+    """What the decoder starts from; rows are ``T`` tracks, then ``Q`` detections.
+
+    Attributes:
+        queries: ``(B, T + Q, C)``.
+        points: ``(B, T + Q, P, 2)``, normalised reference points.
+        valid: ``(B, T + Q) bool``; False for padded track rows.
+        memory: of the track rows.
+        first_frame: ``(B) bool``, the stream has no past.
+    """
+
+    queries: Tensor
+    points: Tensor
+    valid: Tensor
+    memory: Recalled
+    first_frame: Tensor
+
+
+class LineCrossAttention(nn.Module):
+    """Deformable attention of rows to the BEV map: every head looks around each point of the row's line once."""
+
+    def __init__(self, config: MapTrackerConfig) -> None:
+        super().__init__()
+        width, self.heads = config.decoder_width, config.decoder_heads
+        self.grid = (config.rows, config.columns)
+        samples = self.heads * config.points
+        self.sampling_offsets = nn.Linear(width, 2 * samples)
+        self.attention_weights = nn.Linear(width, samples)
+        self.value = nn.Linear(width, width)
+        self.output = nn.Linear(width, width)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, rows: Tensor, points: Tensor, cells: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            rows: ``(B, R, C)``.
+            points: ``(B, R, P, 2)``, normalised.
+            cells: ``(B, H * W, C)``.
+
+        Returns:
+            ``(B, R, C)``, the input included.
+        """
+        batch, count, width = rows.shape
+        height, length = self.grid
+        values = self.value(cells).view(-1, self.heads, width // self.heads)
+        offsets = self.sampling_offsets(rows).view(batch * count, self.heads, 1, -1, 2)
+        weights = self.attention_weights(rows).view(batch * count, self.heads, -1).softmax(dim=-1)
+        x = points[..., 0] * length - 0.5
+        y = (1 - points[..., 1]) * height - 0.5
+        stream = torch.arange(batch, device=rows.device, dtype=torch.int32) * (height * length)
+        attended = deformable_attention(
+            values,
+            stream.repeat_interleave(count),
+            offsets[..., 0] + x.view(batch * count, 1, 1, -1),
+            offsets[..., 1] + y.view(batch * count, 1, 1, -1),
+            weights[:, :, None],
+            [self.grid],
+        )
+        return rows + self.dropout(self.output(attended.view(batch, count, width)))
+
+
+class MemoryAttention(nn.Module):
+    """Attention of each track to its own recalled queries."""
+
+    def __init__(self, config: MapTrackerConfig) -> None:
+        super().__init__()
+        self.attention = _multihead(config)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, tracks: Tensor, memory: Recalled) -> Tensor:
+        """Map tracks ``(B, T, C)`` to ``(B, T, C)``, the input included."""
+        # A padded row has no entries; it attends to zeros instead of to nothing.
+        blocked = ~memory.valid & memory.valid.any(dim=-1, keepdim=True)
+        keys = (memory.queries + memory.code).flatten(0, 1)
+        query, values = tracks.flatten(0, 1)[:, None], memory.queries.flatten(0, 1)
+        attended, _ = self.attention(query, keys, values, key_padding_mask=blocked.flatten(0, 1), need_weights=False)
+        return tracks + self.dropout(attended.view_as(tracks))
+
+
+class RowSelfAttention(nn.Module):
+    """Attention of all rows to each other."""
+
+    def __init__(self, config: MapTrackerConfig) -> None:
+        super().__init__()
+        self.attention = _multihead(config)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, rows: Tensor, valid: Tensor) -> Tensor:
+        """Map rows ``(B, R, C)`` to ``(B, R, C)``, the input included; rows that are not valid are not looked at."""
+        attended, _ = self.attention(rows, rows, rows, key_padding_mask=~valid, need_weights=False)
+        return rows + self.dropout(attended)
+
+
+class MapTrackerDecoderLayer(nn.Module):
+    """Self-attention, BEV attention, memory attention and a perceptron."""
+
+    def __init__(self, config: MapTrackerConfig) -> None:
+        super().__init__()
+        width = config.decoder_width
+        self.norm_before = config.quirks.norm_before_cross_attention
+        self.self_attention = RowSelfAttention(config)
+        self.bev_attention = LineCrossAttention(config)
+        self.memory_attention = MemoryAttention(config)
+        self.perceptron = ResidualPerceptron(width, config.decoder_hidden, config.dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(4))
+
+    def forward(self, rows: Tensor, points: Tensor, start: DecoderRows, cells: Tensor) -> Tensor:
+        """Refine.
+
+        Args:
+            rows: ``(B, T + Q, C)``.
+            points: ``(B, T + Q, P, 2)``, where they are thought to be, normalised.
+            start: validity, memory and age of the streams.
+            cells: ``(B, H * W, C)`` of the BEV map.
+        """
+        rows = self.norms[0](self.self_attention(rows, start.valid))
+        seen = self.bev_attention(rows, points, cells)
+        if self.norm_before:  # Released weights add the norm of the BEV attention's input to its output.
+            recalled = self._with_memory(self.norms[1](rows), start.memory)
+            rows = torch.where(start.first_frame[:, None, None], seen, recalled + seen)
+        else:
+            rows = self._with_memory(self.norms[1](seen), start.memory)
+        return self.norms[3](self.perceptron(self.norms[2](rows)))
+
+    def _with_memory(self, rows: Tensor, memory: Recalled) -> Tensor:
+        """Replace the track rows, the first ones, by what their memory makes of them."""
+        tracks = memory.queries.shape[1]
+        if tracks == 0:
+            return rows
+        return torch.cat([self.memory_attention(rows[:, :tracks], memory), rows[:, tracks:]], dim=1)
+
+
+class MapTrackerDecoder(nn.Module):
+    """All layers, with one classifier and one polyline branch for all of them."""
+
+    def __init__(self, config: MapTrackerConfig) -> None:
+        super().__init__()
+        width = config.decoder_width
+        self.grid = (config.rows, config.columns)
+        self.input = nn.Conv2d(config.bev_width, width, 1)
+        self.layers = nn.ModuleList(MapTrackerDecoderLayer(config) for _ in range(config.decoder_layers))
+        self.classify = nn.Linear(width, config.classes)
+        self.line = nn.Sequential(
+            nn.Linear(width, 2 * width),
+            nn.LayerNorm(2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, 2 * width),
+            nn.LayerNorm(2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, 2 * config.points),
+        )
+
+    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Decode.
+
+        Args:
+            start: rows to begin with.
+            bev: ``(B, C_bev, H, W)``.
+
+        Returns:
+            Embeddings ``(B, T + Q, C)`` of the last layer, and of every layer the logits ``(B, T + Q, classes)`` and
+            the normalised polylines ``(B, T + Q, P, 2)``.
+        """
+        cells = self.bev_cells(bev)
+        rows, points, predictions = start.queries, start.points, []
+        for layer in self.layers:
+            rows = layer(rows, points, start, cells)
+            logits, lines = self.read_out(rows)
+            predictions.append((logits, lines))
+            points = lines.detach()
+        return rows, predictions
+
+    def read_out(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn embeddings ``(..., C)`` into logits ``(..., classes)`` and normalised polylines ``(..., P, 2)``."""
+        return self.classify(rows), self.line(rows).sigmoid().unflatten(-1, (-1, 2))
+
+    def bev_cells(self, bev: Tensor) -> Tensor:
+        """Project the map and add a sine code of the position: ``(B, H * W, C)``."""
+        projected = self.input(bev)
+        return (projected + position_code(projected.shape[1], self.grid, projected.device)).flatten(2).transpose(1, 2)
+
+
+def position_code(channels: int, grid: tuple[int, int], device: torch.device) -> Tensor:
+    """Return DETR's sine code ``(C, H, W)`` of the cells: the first half tells the row, the second the column."""
+    (rows, columns), half = grid, channels // 2
+    period = 10000.0 ** (torch.arange(half // 2, device=device, dtype=torch.float32) * 2 / half)
+
+    def along(count: int) -> Tensor:
+        place = torch.arange(1, count + 1, device=device, dtype=torch.float32) / (count + 1e-6) * (2 * math.pi)
+        angles = place[:, None] / period
+        return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1).T
+
+    row = along(rows)[:, :, None].expand(-1, -1, columns)
+    column = along(columns)[:, None].expand(-1, rows, -1)
+    return torch.cat([row, column])
+
+
+def _multihead(config: MapTrackerConfig) -> nn.MultiheadAttention:
+    return nn.MultiheadAttention(config.decoder_width, config.decoder_heads, dropout=config.dropout, batch_first=True)

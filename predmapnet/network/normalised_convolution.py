@@ -1,0 +1,34 @@
+"""Convolution and batch norm as one operation where the statistics are fixed."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class NormalisedConvolution(nn.Module):
+    """Convolution without bias, then batch norm.
+
+    In evaluation mode the norm is folded into the kernel, which saves two passes over the features; 1x1 convolutions
+    are computed as the matrix products that they are. Features are channels-last in memory.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, kernel: int, stride: int = 1) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False)
+        self.norm = nn.BatchNorm2d(channels_out)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(N, C_in, h, w)`` to ``(N, C_out, h / stride, w / stride)``."""
+        convolution, norm = self.convolution, self.norm
+        if norm.training:
+            return norm(convolution(features))
+        assert norm.running_mean is not None and norm.running_var is not None
+        scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
+        shift = norm.bias - norm.running_mean * scale
+        kernel = convolution.weight * scale[:, None, None, None]
+        if convolution.kernel_size == (1, 1):
+            down, across = convolution.stride
+            pixels = features[:, :, ::down, ::across].permute(0, 2, 3, 1)
+            return F.linear(pixels, kernel.flatten(1), shift).permute(0, 3, 1, 2)
+        return F.conv2d(features, kernel, shift, convolution.stride, convolution.padding)
