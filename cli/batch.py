@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Weights
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Scheme, SplitScheme, Weights
 
 
 def batch(
@@ -21,6 +21,7 @@ def batch(
     save_frames: Annotated[bool, typer.Option("--save-frames", help="Write what each frame showed (Parquet).")] = False,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    split_scheme: SplitScheme = Scheme.OLD,
     weights: Weights = None,
     device: Device = "auto",
     allow_missing_cameras: AllowMissingCameras = False,
@@ -39,7 +40,7 @@ def batch(
     names = list(scenes or [])
     if len(names) == 1 and Path(names[0]).is_dir():
         data_root, names = Path(names[0]), []
-    source, sentence = open_source(dataset, data_root)
+    source, sentence = open_source(dataset, data_root, split_scheme.value)
     err.print(sentence, markup=False)
     chosen = choose_scenes(source, names, split)
     prepare_folder(out)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.options import DataRoot, Dataset, Device, Weights
+from cli.options import DataRoot, Dataset, Device, OfficialFrames, Scheme, SplitScheme, Weights
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,6 +45,11 @@ def evaluate(
     roi: Annotated[Region, typer.Option(help="Region of a submission, metres.")] = Region.STANDARD,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    split_scheme: SplitScheme = Scheme.OLD,
+    official_frames: OfficialFrames = False,
+    truth_cache: Annotated[
+        bool, typer.Option("--truth-cache/--no-truth-cache", help="Keep the ground truth on disk for the next time.")
+    ] = True,
     weights: Weights = None,
     device: Device = "auto",
 ) -> None:
@@ -59,7 +64,7 @@ def evaluate(
     threads = max(1, available_cores() // jobs)
     use_threads(threads)
     from mapfusion.elements import RegionOfInterest
-    from predmapnet.datasets.selection import open_source
+    from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.errors import UserError
     from predmapnet.evaluation.measurement import pool_scenes
     from predmapnet.evaluation.report import write_figures, write_report
@@ -67,12 +72,21 @@ def evaluate(
 
     if results is not None and not results.exists():
         raise UserError(f"There is no file or folder {results}.")
-    source, sentence = open_source(dataset, data_root)
-    err.print(sentence, markup=False)
     length, width = (float(side) for side in roi.value.split("x"))
     settings = EvaluationSettings(
-        dataset, data_root, results, weights, device, RegionOfInterest(length, width), threads
+        dataset,
+        data_root,
+        split_scheme.value,
+        official_frames,
+        results,
+        weights,
+        device,
+        RegionOfInterest(length, width),
+        threads,
+        default_cache() / "ground-truth" if truth_cache else None,
     )
+    source, sentence = settings.open()
+    err.print(sentence, markup=False)
     scenes = scenes_to_measure(settings, source, split)
     measured = []
     with progress_display() as display:
@@ -82,7 +96,14 @@ def evaluate(
             display.scenes(len(measured), len(scenes))
     total = pool_scenes(measured)
     figures = total.figures()
-    context = {"dataset": source.name, "split": split, "synthetic": source.synthetic, "scenes": list(total.scenes)}
+    context = {
+        "dataset": source.name,
+        "split": split,
+        "split_scheme": split_scheme.value,
+        "official_frames": official_frames,
+        "synthetic": source.synthetic,
+        "scenes": list(total.scenes),
+    }
     out.print(_table(figures))
     for line in _lines(figures):
         out.print(line, markup=False)

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+class Scheme(StrEnum):
+    """Ways to divide a data set into training and validation."""
+
+    OLD = "old"
+    NEW = "new"
+
 
 Dataset = Annotated[
     str | None,
@@ -15,6 +24,17 @@ Dataset = Annotated[
 ]
 DataRoot = Annotated[
     Path | None, typer.Option(help="Folder of the data set; or set PREDMAPNET_DATA_ROOT.", show_default=False)
+]
+SplitScheme = Annotated[
+    Scheme,
+    typer.Option(help="Which splits: old (the data set's own) or new (geographically disjoint, of StreamMapNet)."),
+]
+OfficialFrames = Annotated[
+    bool,
+    typer.Option(
+        "--official-frames",
+        help="Argoverse 2: the very frames of the published benchmarks, counted across all logs of the split.",
+    ),
 ]
 Weights = Annotated[
     Path | None, typer.Option(help="Checkpoint (safetensors). By default the one that comes with PredMapNet.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import DataRoot, Dataset
+from cli.options import DataRoot, Dataset, OfficialFrames, Scheme, SplitScheme
 
 
 def scenes(
@@ -15,11 +15,13 @@ def scenes(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    split_scheme: SplitScheme = Scheme.OLD,
+    official_frames: OfficialFrames = False,
 ) -> None:
     """List the scenes of a data set."""
     from predmapnet.datasets.selection import open_source
 
-    source, sentence = open_source(dataset, data_root)
+    source, sentence = open_source(dataset, data_root, split_scheme.value, official_frames)
     found = source.scenes(split)
     if as_json:
         import orjson

@@ -12,23 +12,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
 from mapfusion.integrator import MapIntegrator
 from predmapnet.datasets.selection import open_source
-from predmapnet.datasets.source import Frame, Progress, Scene, SceneSource
+from predmapnet.datasets.source import Instant, Progress, Scene, SceneSource
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.frames_io import read_frames, stored_scenes
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
-from predmapnet.evaluation.submission import SubmittedFrame, read_submission
+from predmapnet.evaluation.submission import NOTHING, SubmittedFrame, position_name, read_submission
 from predmapnet.threads import use_threads
 
 if TYPE_CHECKING:
     from predmapnet.mapper import Mapper
 
-Float = NDArray[np.float64]
+Submitted = dict[str, SubmittedFrame]
+"""Frames of a submission by name."""
 
 
 @dataclass(frozen=True)
@@ -37,33 +37,42 @@ class EvaluationSettings:
 
     Attributes:
         dataset, data_root: where frames, poses and ground truth come from.
+        split_scheme, official_frames: see :func:`predmapnet.datasets.selection.open_source`.
         results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
         weights, device: of the network that maps.
         roi: region of a submission, which does not say it itself.
         threads: CPU threads of each process.
+        cache: folder that keeps the ground truth; None computes it anew.
     """
 
     dataset: str | None = None
     data_root: Path | None = None
+    split_scheme: str = "old"
+    official_frames: bool = False
     results: Path | None = None
     weights: Path | None = None
     device: str = "auto"
     roi: RegionOfInterest = field(default_factory=RegionOfInterest)
     threads: int = 1
+    cache: Path | None = None
+
+    def open(self) -> tuple[SceneSource, str]:
+        """Open the data set; returns what :func:`predmapnet.datasets.selection.open_source` does."""
+        return open_source(self.dataset, self.data_root, self.split_scheme, self.official_frames)
 
 
 def scenes_to_measure(settings: EvaluationSettings, source: SceneSource, split: str | None) -> list[str]:
     """List the scenes: those of the split, or else those that the results hold, by name.
 
     Raises:
-        UserError: there is none, or the results lack scenes of the split.
+        UserError: there is none, the results lack scenes of the split, or hold frames that the data set does not.
     """
     wanted = sorted(scene.name for scene in source.scenes(split))
     if not wanted:
         raise UserError(f"{source.name} holds no scene{f' of the split {split}' if split else ''}.")
     if settings.results is None:
         return wanted
-    held = _scenes_in(settings.results, source, wanted)
+    held = _scenes_in(settings.results, source, split is None)
     if split is None:
         unknown = sorted(held - set(wanted))
         if unknown:
@@ -92,14 +101,15 @@ def measure_scenes(
     Raises:
         UserError: data or results are broken; the message says which.
     """
+    submitted = _submitted_of(settings, scenes)
     if jobs == 1:
         for scene in scenes:
-            yield _measure(settings, scene, preparing)
+            yield _measure(settings, scene, submitted.get(scene), preparing)
         return
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(settings.threads,))
     try:
-        futures = [pool.submit(_measure, settings, scene) for scene in scenes]
+        futures = [pool.submit(_measure, settings, scene, submitted.get(scene)) for scene in scenes]
         for future in futures:
             yield future.result()
     except BaseException:
@@ -117,20 +127,27 @@ def _begin_worker(threads: int) -> None:
     use_threads(threads)
 
 
-def _measure(settings: EvaluationSettings, name: str, preparing: Progress | None = None) -> SceneMeasurement:
+def _measure(
+    settings: EvaluationSettings, name: str, submitted: Submitted | None, preparing: Progress | None = None
+) -> SceneMeasurement:
     scene = _source(settings).open(name, preparing)
     if settings.results is None:
         from predmapnet.streaming import map_scene
 
         run = map_scene(scene, _mapper(settings))
-        return measure_scene(_with_truth(scene, run.frame_maps), run.global_map, scene.truth_map(), run.seconds)
-    frame_maps = _stored_maps(settings.results, settings.roi, scene)
-    return measure_scene(_with_truth(scene, frame_maps), _integrated(name, frame_maps), scene.truth_map())
+        frames = _with_truth(scene, run.frame_maps, settings.cache)
+        return measure_scene(frames, run.global_map, scene.truth_map(), run.seconds)
+    if submitted is not None:
+        frame_maps = _submitted_maps(submitted, settings.roi, scene)
+    else:
+        frame_maps = _stored_maps(settings.results, scene)
+    frames = _with_truth(scene, frame_maps, settings.cache)
+    return measure_scene(frames, _integrated(name, frame_maps), scene.truth_map())
 
 
 @lru_cache(maxsize=1)
 def _source(settings: EvaluationSettings) -> SceneSource:
-    return open_source(settings.dataset, settings.data_root)[0]
+    return settings.open()[0]
 
 
 @lru_cache(maxsize=1)
@@ -141,12 +158,30 @@ def _mapper(settings: EvaluationSettings) -> Mapper:
 
 
 @lru_cache(maxsize=1)
-def _submission(path: Path) -> dict[str, SubmittedFrame]:
-    return dict(read_submission(path))
+def _submission(path: Path) -> Submitted:
+    return read_submission(path)
 
 
-def _scenes_in(results: Path, source: SceneSource, wanted: Sequence[str]) -> set[str]:
-    """Names of the scenes that results hold; a submission names frames only, so scenes are looked through."""
+def _submitted_of(settings: EvaluationSettings, scenes: Sequence[str]) -> dict[str, Submitted]:
+    """Frames of a submission by scene: it is read once, each process gets its share. Empty for our own files."""
+    if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
+        return {}
+    submission = _submission(settings.results)
+    of_scene: dict[str, Submitted] = {scene: {} for scene in scenes}
+    for name, scene in _scene_by_name(submission, _source(settings)).items():
+        if scene in of_scene:
+            of_scene[scene][name] = submission[name]
+    return of_scene
+
+
+def _scene_by_name(submission: Submitted, source: SceneSource) -> dict[str, str]:
+    """Scene of each frame of a submission that the data set knows."""
+    positions = {position_name(info.name, index): info.name for info in source.scenes() for index in range(info.frames)}
+    return source.scenes_of(submission) | {name: positions[name] for name in submission if name in positions}
+
+
+def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str]:
+    """Names of the scenes that results hold; ``every_frame``: all frames of a submission must be known."""
     if results.is_dir():
         names = {path.stem for path in results.glob("*.parquet")}
         if not names:
@@ -156,40 +191,54 @@ def _scenes_in(results: Path, source: SceneSource, wanted: Sequence[str]) -> set
             )
         return names
     if results.suffix == ".json":
-        tokens = set(_submission(results))
-        return {name for name in wanted if any(frame.token in tokens for frame in _frames(source.open(name)))}
+        submission = _submission(results)
+        scenes = _scene_by_name(submission, source)
+        unknown = [name for name in submission if name not in scenes]
+        if not scenes or (unknown and every_frame):
+            example = f", {unknown[0]} for one" if unknown else ""
+            hint = " Does it need --official-frames?" if source.name == "argoverse2" else ""
+            raise UserError(
+                f"{results}: {len(unknown)} of {len(submission)} frames are not in {source.name} in {source.root}"
+                f"{example}. Name another data set, or a --split to measure only that.{hint}"
+            )
+        return set(scenes.values())
     return set(stored_scenes(results))
 
 
-def _stored_maps(results: Path, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
-    """What results say of each frame of a scene; a frame that they do not name holds no prediction."""
-    if results.suffix == ".json":
-        submission = _submission(results)
-        nothing = SubmittedFrame(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64), ())
-        return [submission.get(frame.token, nothing).at(frame, roi) for frame in _frames(scene)]
+def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
+    """What a submission says of each frame of a scene; a frame that it does not name holds no prediction."""
+    maps = []
+    for index in range(len(scene)):
+        instant = scene.instant(index)
+        names = (instant.token, str(instant.timestamp), position_name(scene.info.name, index))
+        found = next((submitted[name] for name in names if name in submitted), NOTHING)
+        maps.append(found.at(instant, roi))
+    return maps
+
+
+def _stored_maps(results: Path, scene: Scene) -> list[FrameMap]:
+    """What our own files say of each frame of a scene; a frame that they do not name holds no prediction."""
     name = scene.info.name
     path = results / f"{name}.parquet" if results.is_dir() else results
     stored = {frame.index: frame.frame_map for frame in read_frames(path, name).frames}
     if not stored:
         raise UserError(f"{path} holds no frame of {name}.")
+    if max(stored) >= len(scene) or min(stored) < 0:
+        raise UserError(f"{path} holds frame {max(stored)} of {name}, which has {len(scene)} frames in the data set.")
     roi = next(iter(stored.values())).roi
-    return [_at(path, frame, stored.get(frame.index), roi) for frame in _frames(scene)]
+    return [_at(path, name, index, scene.instant(index), stored.get(index), roi) for index in range(len(scene))]
 
 
-def _at(path: Path, frame: Frame, stored: FrameMap | None, roi: RegionOfInterest) -> FrameMap:
+def _at(
+    path: Path, scene: str, index: int, instant: Instant, stored: FrameMap | None, roi: RegionOfInterest
+) -> FrameMap:
     if stored is None:
-        nothing = np.zeros(0, dtype=np.int64)
-        return FrameMap(frame.timestamp, frame.ego_to_global, roi, nothing, np.zeros(0), nothing, ())
-    if not np.allclose(stored.ego_to_global, frame.ego_to_global, atol=1e-3):
+        return NOTHING.at(instant, roi)
+    if not np.allclose(stored.ego_to_global, instant.ego_to_global, atol=1e-3):
         raise UserError(
-            f"{path}, {frame.scene}, frame {frame.index}: the pose is not the data set's; the results were made from "
-            "other data."
+            f"{path}, {scene}, frame {index}: the pose is not the data set's; the results were made from other data."
         )
     return stored
-
-
-def _frames(scene: Scene) -> Iterator[Frame]:
-    return (scene.frame(index) for index in range(len(scene)))
 
 
 def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
@@ -202,11 +251,9 @@ def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
     return integrator.map()
 
 
-def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap]) -> list[EvaluationFrame]:
-    frames = []
-    for index, frame_map in enumerate(frame_maps):
-        truth = scene.truth(index, frame_map.roi)
-        if truth is None:
-            raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
-        frames.append(EvaluationFrame(scene.info.name, index, frame_map, truth))
-    return frames
+def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap], cache: Path | None) -> list[EvaluationFrame]:
+    truths = scene.truths(frame_maps[0].roi, cache) if frame_maps else []
+    if truths is None:
+        raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
+    pairs = zip(frame_maps, truths, strict=True)
+    return [EvaluationFrame(scene.info.name, index, found, truth) for index, (found, truth) in enumerate(pairs)]

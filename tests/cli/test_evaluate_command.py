@@ -68,15 +68,68 @@ def test_the_truth_as_results_is_perfect_in_parquet_and_as_a_submission(predmapn
         for index, frame_map in enumerate(maps)
     }
     (tmp_path / "submission.json").write_text(json.dumps({"meta": {}, "results": entries}))
+    tracked = [
+        entry | {"scene_name": "scene-0001", "local_idx": index, "global_ids": maps[index].track_ids.tolist()}
+        for index, entry in enumerate(entries.values())
+    ]
+    (tmp_path / "pos_predictions.json").write_text(json.dumps(tracked))
     present = {kind for frame_map in maps for kind in frame_map.kinds.tolist()}
-    for name in ("frames.parquet", "submission.json"):
+    for name in ("frames.parquet", "submission.json", "pos_predictions.json"):
         result = predmapnet("evaluate", tmp_path / name, "--data-root", tiny_root, "--json", tmp_path / "f.json")
         assert result.code == 0, result.err
         figures = json.loads((tmp_path / "f.json").read_text())
         assert figures["scenes"] == 1
+        assert figures["consistency_ap"]["ids"] == ("formed" if name == "submission.json" else "tracker")
         assert figures["chamfer_ap"]["mAP"] == pytest.approx(len(present) / 3)
         assert figures["raster_ap"]["mAP"] == pytest.approx(1.0)
         assert figures["consistency_ap"]["mAP"] == pytest.approx(len(present) / 3)
+
+
+def test_the_new_split_measures_other_scenes(predmapnet, tiny_root, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("scene-0001", "scene-0002"):
+        write_frames(folder / f"{name}.parquet", name, truth_as_results(tiny_root, name)[1], {})
+    measured = {}
+    for scheme in ("old", "new"):
+        arguments = [
+            "--data-root",
+            tiny_root,
+            "--split-scheme",
+            scheme,
+            "--split",
+            "val",
+            "--json",
+            tmp_path / "f.json",
+        ]
+        result = predmapnet("evaluate", folder, *arguments)
+        listed = json.loads(predmapnet("scenes", "--json", *arguments[:-2]).out)
+        measured[scheme] = [scene["name"] for scene in listed]
+        if measured[scheme]:
+            assert result.code == 0, result.err
+            assert json.loads((tmp_path / "f.json").read_text())["evaluated"]["scenes"] == measured[scheme]
+    assert "scene-0001" in measured["new"] and measured["new"] != measured["old"]
+
+
+def test_truth_is_kept_and_used_again(predmapnet, tiny_root, tmp_path):
+    write_frames(tmp_path / "frames.parquet", "scene-0001", truth_as_results(tiny_root, "scene-0001")[1], {})
+    arguments = ["evaluate", tmp_path / "frames.parquet", "--data-root", tiny_root, "--json"]
+    assert predmapnet(*arguments, tmp_path / "none.json", "--no-truth-cache").code == 0
+    assert not (tmp_path / "cache").exists()
+    for name in ("first", "second"):
+        assert predmapnet(*arguments, tmp_path / f"{name}.json").code == 0
+        assert len(list((tmp_path / "cache" / "ground-truth").iterdir())) == 1
+    contents = {(tmp_path / f"{name}.json").read_bytes() for name in ("none", "first", "second")}
+    assert len(contents) == 1
+
+
+def test_frames_of_another_data_set_are_named(predmapnet, tiny_root, tmp_path):
+    entry = {"vectors": [], "scores": [], "labels": []}
+    known = NuScenesSource(tiny_root).open("scene-0001").frame(0).token
+    (tmp_path / "submission.json").write_text(json.dumps({"results": {known: entry, "elsewhere": entry}}))
+    result = predmapnet("evaluate", tmp_path / "submission.json", "--data-root", tiny_root)
+    assert result.code == 2 and "1 of 2 frames are not in nuscenes" in " ".join(result.err.split())
+    assert "elsewhere" in result.err
 
 
 def test_what_cannot_be_measured_is_said_in_one_message(predmapnet, tiny_root, tmp_path):

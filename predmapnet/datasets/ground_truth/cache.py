@@ -1,30 +1,44 @@
 """Keep a scene's ground truth on disk, under a key made of everything that it depends on.
 
 A key that leaves something out goes stale unseen: annotation caches that outlived a change of their region or split
-have spoilt published figures. So the key covers the map's bytes, every pose, the region and this code's version.
+have spoilt published figures. So the key covers the map's bytes, every pose, the region, the text of the code that
+extracts, and the versions of the libraries that do the geometry.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from mapfusion import geometry
 from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets.source import FrameTruth
+from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 
-EXTRACTION_VERSION = 1
-"""Goes up with every change of the ground-truth code that can change a result."""
+
+@cache
+def code_fingerprint() -> bytes:
+    """Digest of the ground-truth code as it is installed, and of the libraries that compute for it."""
+    digest = hashlib.sha256(
+        f"numpy {np.__version__} shapely {shapely.__version__} geos {shapely.geos_version}".encode()
+    )
+    for path in (*sorted(Path(__file__).parent.glob("*.py")), Path(geometry.__file__)):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.digest()
 
 
 def cache_key(fingerprint: bytes, poses: Sequence[Float], roi: RegionOfInterest, dataset: str) -> str:
@@ -41,7 +55,8 @@ def cache_key(fingerprint: bytes, poses: Sequence[Float], roi: RegionOfInterest,
     """
     digest = hashlib.sha256()
     parts = (
-        f"{dataset} {EXTRACTION_VERSION} {roi.length!r} {roi.width!r} {len(poses)}".encode(),
+        f"{dataset} {roi.length!r} {roi.width!r} {len(poses)}".encode(),
+        code_fingerprint(),
         fingerprint,
         np.ascontiguousarray(poses, dtype=np.float64).tobytes(),
     )
@@ -80,17 +95,22 @@ def cached_truths(folder: Path, key: str, compute: Callable[[], Sequence[FrameTr
         folder: of the cache.
         key: see :func:`cache_key`.
         compute: gives the truth of every frame in order.
+
+    Raises:
+        UserError: the folder cannot be written to.
     """
     path = folder / f"truth-{key}.npz"
-    try:
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return _load(path)
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-        path.unlink(missing_ok=True)
     truths = list(compute())
-    folder.mkdir(parents=True, exist_ok=True)
-    _save(path, truths)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _save(path, truths)
+    except OSError as error:
+        raise UserError(
+            f"The ground truth cannot be kept in {folder} ({error.strerror or error}): set PREDMAPNET_CACHE to another "
+            "folder, or do without."
+        ) from error
     return truths
 
 

@@ -1,6 +1,7 @@
 """Ground truth on disk: any change of what it depends on changes its key, and damage never gets through."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from predmapnet.datasets.ground_truth import cache
 from predmapnet.datasets.ground_truth.cache import cache_key, cached_truths
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.errors import UserError
 
 ROI = RegionOfInterest()
 POSES = [np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])]
@@ -32,7 +34,7 @@ def test_any_input_changes_the_key(monkeypatch):
         cache_key(b"map", POSES, RegionOfInterest(30, 60), "nuscenes"),
         cache_key(b"map", POSES, ROI, "argoverse2"),
     ]
-    monkeypatch.setattr(cache, "EXTRACTION_VERSION", cache.EXTRACTION_VERSION + 1)
+    monkeypatch.setattr(cache, "code_fingerprint", lambda: b"code of another version")
     keys.append(cache_key(b"map", POSES, ROI, "nuscenes"))
     assert len(set(keys)) == len(keys)
     monkeypatch.undo()
@@ -44,6 +46,45 @@ def test_any_change_of_a_map_changes_its_fingerprint(small_map):
     assert NuScenesGroundTruth(json.loads(json.dumps(small_map))).fingerprint == before
     small_map["node"][0]["x"] += 1e-9
     assert NuScenesGroundTruth(small_map).fingerprint != before
+
+
+def test_any_change_of_the_code_or_of_a_library_changes_its_fingerprint(tmp_path, monkeypatch):
+    fingerprints = {cache.code_fingerprint()}
+    for path in Path(cache.__file__).parent.glob("*.py"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    compute = cache.code_fingerprint.__wrapped__
+    assert compute() in fingerprints, "where the code lies does not matter"
+    with (tmp_path / "crossings.py").open("a") as file:
+        file.write("\n")
+    fingerprints.add(compute())
+    for library, name in ((cache.np, "__version__"), (cache.shapely, "__version__"), (cache.shapely, "geos_version")):
+        monkeypatch.setattr(library, name, "another")
+        fingerprints.add(compute())
+    assert len(fingerprints) == 5
+
+
+def test_the_truth_follows_every_change_of_map_and_poses(nuscenes_root, folder):
+    """The cache may only ever give what would be computed now."""
+
+    def check():
+        scene = NuScenesSource(nuscenes_root).open("scene-0061")
+        same(scene.truths(ROI, folder), scene.truths(ROI))
+        return len(list(folder.iterdir()))
+
+    assert check() == check() == 1
+    expansion = nuscenes_root / "maps" / "expansion" / "singapore-onenorth.json"
+    expansion.write_text(expansion.read_text().replace('"x": 103', '"x": 102.5'))
+    assert check() == 2
+    poses = nuscenes_root / "v1.0-mini" / "ego_pose.json"
+    poses.write_text(poses.read_text().replace("85.0", "85.25"))
+    assert check() == 3
+
+
+def test_a_cache_that_cannot_be_written_is_named(scene, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"cannot be kept in .*set PREDMAPNET_CACHE"):
+        scene.truths(ROI, tmp_path / "file" / "cache")
 
 
 @pytest.fixture

@@ -104,18 +104,66 @@ def test_a_submission_is_read_by_token(tmp_path):
     np.testing.assert_array_equal(frames["a"].polylines[1], [[4, 5], [6, 7]])
 
 
+def submission(tmp_path, content):
+    path = tmp_path / "submission.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_what_maptracker_writes_beside_is_ignored_and_flat_vectors_are_points(tmp_path):
+    entry = {"vectors": [[0, 1, 2, 3]], "scores": [0.5], "labels": [1.0], "props": [0]}
+    entry |= {"track_vectors": [], "track_scores": [], "track_labels": [], "semantic_mask": [[0]]}
+    empty = {"vectors": [], "scores": [], "labels": [], "props": []}
+    frames = read_submission(submission(tmp_path, {"results": {"a": entry, "b": empty}}))
+    np.testing.assert_array_equal(frames["a"].polylines[0], [[0, 1], [2, 3]])
+    assert frames["a"].kinds.tolist() == [1] and len(frames["b"].kinds) == 0
+
+
+def test_tracked_positions_saved_as_json_are_called_by_scene_and_place(tmp_path):
+    entry = {"vectors": [[0, 1, 2, 3]], "scores": [0.5], "labels": [1], "global_ids": [4]}
+    entries = [entry | {"scene_name": "scene-0003", "local_idx": index, "meta": {}} for index in range(2)]
+    frames = read_submission(submission(tmp_path, entries))
+    assert list(frames) == ["scene-0003/0", "scene-0003/1"]
+    assert frames["scene-0003/1"].track_ids.tolist() == [4]
+
+
+def test_nan_in_a_submission_is_left_for_the_check_that_names_the_element(tmp_path):
+    entry = {"vectors": [[[0, 1], [float("nan"), 3]]], "scores": [0.5], "labels": [1]}
+    frames = read_submission(submission(tmp_path, {"results": {"a": entry}}))
+    assert np.isnan(frames["a"].polylines[0][1, 0])
+
+
+NORMALISED = {"vectors": [[[0.1, 0.2], [0.3, 0.4]]] * 10, "scores": [1] * 10, "labels": [1] * 10}
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ("{", "not valid JSON"),
-        ("[]", "no object 'results'"),
+        ("[]", "holds no frame"),
+        ("3", "no object 'results'"),
+        ('{"results": {}}', "holds no frame"),
+        ('{"abc": {"vectors": []}}', "no object 'results'"),
+        ('{"results": {"t": null}}', "frame t: an object .* is expected, not None"),
         ('{"results": {"t": {"vectors": [], "scores": []}}}', "frame t: labels missing"),
         ('{"results": {"t": {"vectors": [], "scores": [1], "labels": []}}}', "0 vectors, 1 scores"),
-        ('{"results": {"t": {"vectors": [["x"]], "scores": [1], "labels": [0]}}}', "frame t: vectors"),
+        (
+            '{"results": {"t": {"vectors": [["x"]], "scores": [1], "labels": [0]}}}',
+            "frame t, vector 0 is not a list of",
+        ),
+        (
+            '{"results": {"t": {"vectors": [[1, 2, 3]], "scores": [1], "labels": [0]}}}',
+            r"vector 0 has the shape \(3,\)",
+        ),
+        ('{"results": {"t": {"vectors": [[[1], [2]]], "scores": [1], "labels": [0]}}}', "vector 0 has the shape"),
+        ('{"results": {"t": {"vectors": [[1, 2]], "scores": [1], "labels": ["divider"]}}}', "labels are not numbers"),
+        ('{"results": {"t": {"vectors": [[1, 2]], "scores": [1], "labels": [0.5]}}}', "not all whole numbers"),
+        ('[{"vectors": [], "scores": [], "labels": []}]', "entry 0: .* scene_name and local_idx"),
+        ([{"scene_name": "s", "local_idx": 0, "vectors": [], "scores": [], "labels": []}] * 2, "s/0 twice"),
+        ({"results": [{"sample_token": "t", "vectors": []}]}, "result file of MapTR .* Convert it"),
+        ({"results": {"t": NORMALISED}}, "normalised; metres are expected"),
     ],
 )
 def test_a_broken_submission_is_named(tmp_path, content, message):
-    path = tmp_path / "submission.json"
-    path.write_text(content)
     with pytest.raises(UserError, match=message):
-        read_submission(path)
+        read_submission(submission(tmp_path, content))
