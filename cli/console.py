@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from predmapnet.batch import Outcome
-    from predmapnet.pipeline import SceneReport
+    from predmapnet.pipeline import MappingPipeline, SceneReport
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -110,6 +110,12 @@ def report_lines(report: SceneReport) -> list[str]:
         )
     lines.extend(f"written: {path}" for path in report.written)
     return lines
+
+
+def say_note(pipeline: MappingPipeline) -> None:
+    """Warn where real photographs meet weights that never saw any."""
+    if pipeline.note and not pipeline.source.synthetic:
+        say_warning(pipeline.note)
 
 
 def say_report(report: SceneReport) -> None:

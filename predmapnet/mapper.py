@@ -56,12 +56,20 @@ class Mapper:
     Attributes:
         config: of the network.
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
+        trained_on: name of the data set that the weights were trained on, if the file tells.
     """
 
-    def __init__(self, network: PredMapNet, device: str | torch.device = "cpu", weights_sha256: str = "") -> None:
+    def __init__(
+        self,
+        network: PredMapNet,
+        device: str | torch.device = "cpu",
+        weights_sha256: str = "",
+        trained_on: str | None = None,
+    ) -> None:
         self.network = network.to(device).eval()
         self.config: PredMapNetConfig = network.config
         self.weights_sha256 = weights_sha256
+        self.trained_on = trained_on
         self._device = torch.device(device)
         self._lookups: list[tuple[Rig, RigLookup]] = []
 
@@ -77,7 +85,7 @@ class Mapper:
             UserError: the weights or the device are not there.
         """
         checkpoint = load_checkpoint(path)
-        return cls(checkpoint.network, choose_device(device), checkpoint.sha256)
+        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts.get("data"))
 
     @property
     def roi(self) -> RegionOfInterest:

@@ -16,6 +16,7 @@ import torch
 import predmapnet
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
 from mapfusion.export.geojson import write_geojson
+from predmapnet.datasets.demo import DemoSource
 from predmapnet.datasets.selection import open_source
 from predmapnet.datasets.source import Progress, Scene, SceneSource
 from predmapnet.errors import UserError
@@ -37,6 +38,11 @@ SEED = 0
 
 SYNTHETIC_NOTE = (
     "This is a map of the synthetic demo world: its roads do not exist, and its coordinates lie where no real road is."
+)
+
+REAL_NOTE = (
+    "The weights were trained on the synthetic demo world alone: on real photographs they show that everything runs, "
+    "not how well PredMapNet maps."
 )
 
 
@@ -181,9 +187,16 @@ class MappingPipeline:
             "weights_sha256": self.mapper.weights_sha256,
             "seed": SEED,
         }
-        if self.source.synthetic:
-            provenance["note"] = SYNTHETIC_NOTE
+        if self.note:
+            provenance["note"] = self.note
         return provenance
+
+    @property
+    def note(self) -> str:
+        """What a reader of the map has to know about where it comes from; empty if nothing."""
+        if self.source.synthetic:
+            return SYNTHETIC_NOTE
+        return REAL_NOTE if self.mapper.trained_on == DemoSource.name else ""
 
 
 class _ProgressObserver:
@@ -225,7 +238,7 @@ def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | No
 
 def describe(provenance: Mapping[str, Any]) -> str:
     """Tell in Markdown what a recording shows, for someone who finds the file."""
-    note = f"\n\n**Synthetic.** {provenance['note']}" if provenance["synthetic"] else ""
+    note = f"\n\n**Mind.** {provenance['note']}" if "note" in provenance else ""
     return f"""# {provenance["scene"]} ({provenance["dataset"]}){note}
 
 PredMapNet {provenance["version"]} looks through the cameras at one instant after the other and draws

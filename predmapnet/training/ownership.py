@@ -149,13 +149,13 @@ def _choose_of_stream(
             keeper[owned] = row
     newborn: list[int] = []
     false: list[int] = []
-    for row in track_rows + np.flatnonzero(confident[track_rows:]):
+    for row in (track_rows + np.flatnonzero(confident[track_rows:])).tolist():
         if truth[row] < 0:
-            false.append(int(row))
+            false.append(row)
         elif truth[row] not in keeper:
-            newborn.append(int(row))
+            newborn.append(row)
         elif scores[row] > scores[keeper[truth[row]]] and generator.random() < settings.refresh:
-            source[keeper[truth[row]]] = int(row)
+            source[keeper[truth[row]]] = row
     strays = generator.permutation(false)[: generator.integers(0, settings.false_tracks + 1)]
     newborn += [int(row) for row in strays]
     rows = [*source.values(), *newborn]
