@@ -152,7 +152,10 @@ class Mapper:
         outputs = self.network(inputs, self._lookup(frame.rig), state)
         selection = select(outputs, state, self.config)
         state = self.network.advance(state, outputs, selection.instances, inputs)
-        return _frame_map(frame, selection, state, outputs.segmentation, self.config), state
+        frame_map = to_frame_map(
+            selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
+        )
+        return frame_map, state
 
     def _lookup(self, rig: Rig) -> RigLookup:
         """Return the look-up of a rig, from the few that were used last."""
@@ -212,10 +215,24 @@ def _of_size(image: Image, width: int, height: int, path: Path) -> Image:
     return image
 
 
-def _frame_map(
-    frame: Frame, selection: Selection, state: StreamState, segmentation: Tensor, config: PredMapNetConfig
+def to_frame_map(
+    selection: Selection,
+    state: StreamState,
+    segmentation: Tensor,
+    config: PredMapNetConfig,
+    timestamp: int,
+    ego_to_global: Float,
 ) -> FrameMap:
-    """Everything that is reported of one frame: tracks first, then detections without a track."""
+    """Everything that is reported of one frame of one stream: tracks first, then detections without a track.
+
+    Args:
+        selection: what :func:`predmapnet.network.tracking.select` chose.
+        state: after the frame.
+        segmentation: ``(1, 3, H_s, W_s)`` logits.
+        config: of the network.
+        timestamp: nanoseconds.
+        ego_to_global: ``(4, 4) float64``.
+    """
     tracks, others = _rows(selection.instances), _rows(selection.detections)
     kinds = np.concatenate([tracks["labels"], others["labels"]])
     points = np.concatenate([tracks["points"], others["points"]])
@@ -230,8 +247,8 @@ def _frame_map(
         remembered = state.history_maps[0][valid].float().cpu().numpy()
         masks = np.concatenate([remembered, np.zeros((len(others["labels"]), *config.mask_size), dtype=np.float32)])
     return FrameMap(
-        timestamp=frame.timestamp,
-        ego_to_global=frame.ego_to_global,
+        timestamp=timestamp,
+        ego_to_global=ego_to_global,
         roi=config.roi,
         kinds=kinds,
         scores=np.concatenate([tracks["scores"], others["scores"]]).astype(np.float64),

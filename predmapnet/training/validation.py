@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mapfusion.elements import ElementKind, FrameMap
+from mapfusion.elements import FrameMap
 from predmapnet.config import PredMapNetConfig
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.mapper import to_frame_map
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs, Selection, StreamState
+from predmapnet.network.interface import FrameInputs
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import select
 from predmapnet.network.view_transform import RigLookup
@@ -25,6 +26,7 @@ EVERY = 4
 """Every fourth frame is measured: neighbours look alike."""
 FIRST = 3
 """The first measured frame, so that streams have something to remember."""
+FRAME_INTERVAL_NS = 500_000_000
 
 
 @torch.no_grad()
@@ -45,16 +47,14 @@ def validate(
     """
     frames: list[EvaluationFrame] = []
     for scene in scenes:
-        state: StreamState | None = None
-        for index in range(0 if streaming else FIRST, len(scene), 1 if streaming else EVERY):
-            inputs = _inputs(scene, index, network.config)
-            outputs = network(inputs, lookup, state)
-            chosen = select(outputs, state, network.config)
-            if streaming:
-                state = network.advance(state, outputs, chosen.instances, inputs)
-            if index % EVERY == FIRST:
-                predicted = _frame_map(chosen, scene.ego_to_global[index], network.config)
-                frames.append(EvaluationFrame(scene.name, index, predicted, scene.truths[index]))
+        measured = range(FIRST, len(scene), EVERY)
+        indices = range(len(scene)) if streaming else measured
+        maps = map_frames(network, lookup, scene, indices, streaming)
+        frames += [
+            EvaluationFrame(scene.name, index, predicted, scene.truths[index])
+            for index, predicted in zip(indices, maps, strict=True)
+            if index in measured
+        ]
     result = chamfer_average_precision(frames, thresholds_for(network.config.roi))
     figures = {"mAP": result.mean}
     for of_kind in result.kinds:
@@ -64,32 +64,36 @@ def validate(
     return figures
 
 
+@torch.no_grad()
+def map_frames(
+    network: PredMapNet, lookup: RigLookup, scene: CachedScene, indices: Iterable[int], streaming: bool
+) -> Iterator[FrameMap]:
+    """Yield the maps of some frames of a cached scene.
+
+    Args:
+        network: in evaluation mode.
+        lookup: of the scene's rig.
+        scene: whose images are at the network's size; it knows no times, so frames count as half a second apart.
+        indices: the frames, in order.
+        streaming: hand the state on from frame to frame.
+    """
+    config = network.config
+    empty = network.initial_state(1)
+    state = empty
+    for index in indices:
+        inputs = _inputs(scene, index, config)
+        outputs = network(inputs, lookup, state)
+        selection = select(outputs, state, config)
+        after = network.advance(state, outputs, selection.instances, inputs)
+        pose = scene.ego_to_global[index]
+        yield to_frame_map(selection, after, outputs.segmentation, config, index * FRAME_INTERVAL_NS, pose)
+        state = after if streaming else empty
+
+
 def _inputs(scene: CachedScene, index: int, config: PredMapNetConfig) -> FrameInputs:
     images = torch.from_numpy(np.array(scene.images[index]))[None]
     return FrameInputs(
         images=normalise_images(images, config.image),
         camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
         ego_to_global=torch.from_numpy(scene.ego_to_global[index])[None],
-    )
-
-
-def _frame_map(selection: Selection, ego_to_global: Float, config: PredMapNetConfig) -> FrameMap:
-    """Everything that is reported of one frame of one stream, in metres."""
-    parts = (selection.instances, selection.detections)
-    kept = [part.valid[0] for part in parts]
-    kinds, scores, track_ids, points = (
-        torch.cat([getattr(part, name)[0][rows] for part, rows in zip(parts, kept, strict=True)]).numpy()
-        for name in ("labels", "scores", "track_ids", "points")
-    )
-    lines = (points.clip(0.0, 1.0).astype(np.float64) - 0.5) * config.roi.size
-    rings = kinds == ElementKind.PED_CROSSING
-    lines[rings, -1] = lines[rings, 0]
-    return FrameMap(
-        timestamp=0,
-        ego_to_global=ego_to_global,
-        roi=config.roi,
-        kinds=kinds,
-        scores=scores.astype(np.float64),
-        track_ids=track_ids,
-        polylines=tuple(lines),
     )
