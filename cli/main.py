@@ -18,6 +18,7 @@ from cli.console import say_error
 from cli.diff import diff
 from cli.evaluate import evaluate
 from cli.infer import infer
+from cli.merge import merge
 from cli.scenes import scenes
 from cli.train import train
 from cli.view import view
@@ -38,6 +39,7 @@ app.command()(batch)
 app.command()(scenes)
 app.command()(evaluate)
 app.command()(train)
+app.command()(merge)
 app.command()(diff)
 
 

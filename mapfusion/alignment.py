@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,16 @@ from mapfusion.stretches import Samples, sample_lines
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
+Rows = NDArray[np.intp]
+
+TURNS = (0.0, 0.6, -0.6, 1.2, -1.2)
+"""Where the search for the turn begins, degrees; all but the first only if that finds no good agreement."""
+
+SEARCH_SAMPLES = 150
+"""Samples that take part in the search on the grid."""
+
+RIVAL_DISTANCE = 2.0
+"""A shift this far from the best one is another answer, not the same one less exactly, metres."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +39,7 @@ class AlignmentConfig:
             parallel lines only, nothing holds along them.
         max_residual: largest root mean square of the trimmed residuals, metres.
         max_turn: largest rotation, degrees.
-        rival_ratio: another shift, at least 1.5 m away, whose agreement reaches this share of the best makes the
+        rival_ratio: another shift, at least 2 m away, whose agreement reaches this share of the best makes the
             choice uncertain (lanes repeat).
         correlation: neighbouring samples err alike; this many count as one.
     """
@@ -112,8 +122,8 @@ def landmarks(global_map: GlobalMap, config: AlignmentConfig | None = None) -> L
 def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None = None) -> Alignment:
     """Find the rigid motion that puts ``source`` on ``target``, and whether to believe it.
 
-    The shift is first looked for on a grid of one metre, by how many samples come to lie near a line of their kind;
-    then refined by Gauss-Newton on distances across lines, the worst fifth left out.
+    The shift is first looked for on a grid of one metre, by how many samples come to lie near a line of their kind
+    (from several turns, if need be); then refined by Gauss-Newton on distances across lines, the worst fifth left out.
 
     Args:
         source, target: from :func:`landmarks`.
@@ -127,17 +137,49 @@ def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None =
         return _refused(f"only {overlap:.0f} m of lines in common ground", overlap)
     points = source.samples.points[common]
     centre = points.mean(axis=0)
-    shift, rival = _search(source, target, common, config)
-    turn = 0.0
+    best: Alignment | None = None
+    for start_turn in TURNS:
+        result = _refine(source, target, common, centre, np.radians(start_turn), config)
+        if best is None or result.overlap > best.overlap:
+            best = result
+        if best.overlap > 0.8 * overlap:
+            break
+    assert best is not None
+    rival = _score(source, target, common, best, _elsewhere(config)).max() / max(
+        float(_score(source, target, common, best, np.zeros((1, 2)))[0]), 1e-9
+    )
+    refusal, disagrees = _doubt(best, best.overlap / overlap, float(rival), config)
+    return replace(best, refusal=refusal, disagrees=disagrees)
+
+
+def _refine(
+    source: Landmarks, target: Landmarks, common: Rows, centre: Float, turn: float, config: AlignmentConfig
+) -> Alignment:
+    """Look for the shift on a grid, then refine shift and turn."""
+    zero = np.zeros(2)
+    grid = _grid(config)
+    found = _score(source, target, common, Alignment(centre, zero, turn, np.eye(3), 0.0, 0.0), grid)
+    shift = grid[int(np.argmax(found))]
     for reach in (3.0, 2.0, 1.5, 1.0, config.close, config.close, config.close):
         step, information, residual, agreed = _step(source, target, common, centre, shift, turn, reach, config)
         shift, turn = shift + step[:2], turn + float(step[2])
         if reach == config.close and np.abs(step).max() < 1e-4:
             break
     shared = float(source.samples.spacing[common][agreed].sum())
-    result = Alignment(centre, shift, turn, information, shared, residual)
-    refusal, disagrees = _doubt(result, shared / overlap, rival, config)
-    return Alignment(centre, shift, turn, information, shared, residual, refusal, disagrees)
+    return Alignment(centre, shift, turn, information, shared, residual)
+
+
+def _grid(config: AlignmentConfig) -> Float:
+    """Shifts a metre apart, ``(n, 2)``, the smallest first."""
+    side = np.arange(-config.reach, config.reach + 0.5)
+    shifts = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(shifts[np.argsort((shifts**2).sum(axis=1), kind="stable")])
+
+
+def _elsewhere(config: AlignmentConfig) -> Float:
+    """Shifts that are not the same place, ``(n, 2)``."""
+    grid = _grid(config)
+    return np.asarray(grid[np.linalg.norm(grid, axis=1) >= RIVAL_DISTANCE])
 
 
 def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentConfig) -> tuple[str, bool]:
@@ -187,19 +229,10 @@ def _nearest(
     return rows, ((base - points) * normal).sum(axis=1), normal
 
 
-def _search(
-    source: Landmarks, target: Landmarks, common: NDArray[np.intp], config: AlignmentConfig
-) -> tuple[Float, float]:
-    """Return the shift of a grid under which most samples agree, and how good the best shift elsewhere is.
-
-    Returns:
-        ``(2,)`` metres; the agreement of the best rival at least 1.5 m away as a share of the best.
-    """
-    thin = common[:: max(1, len(common) // 150)]
-    side = np.arange(-config.reach, config.reach + 0.5)
-    shifts = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    shifts = shifts[np.argsort((shifts**2).sum(axis=1), kind="stable")]
-    moved = source.samples.points[thin][None, :, :] + shifts[:, None, :]
+def _score(source: Landmarks, target: Landmarks, common: Rows, motion: Alignment, shifts: Float) -> Float:
+    """Say how well maps agree under a motion and each of some shifts after it, ``(n,)``; larger is better."""
+    thin = common[:: max(1, len(common) // SEARCH_SAMPLES)]
+    moved = motion.apply(source.samples.points[thin])[None, :, :] + shifts[:, None, :]
     score = np.zeros(len(shifts))
     for kind, (members, tree) in target.trees.items():
         own = np.flatnonzero(source.kinds[thin] == kind)
@@ -212,16 +245,13 @@ def _search(
         along = np.abs((directions * tangent).sum(axis=1)) > np.cos(np.radians(30.0))
         value = np.where(hit & along, np.exp(-0.5 * (np.where(hit, distance, 9.0) / 0.6) ** 2), 0.0)
         score += value.reshape(len(shifts), -1).sum(axis=1)
-    best = int(np.argmax(score))
-    elsewhere = np.linalg.norm(shifts - shifts[best], axis=1) >= 2.0
-    rival = float(score[elsewhere].max() / score[best]) if score[best] > 0 else 1.0
-    return shifts[best], rival
+    return score
 
 
 def _step(
     source: Landmarks,
     target: Landmarks,
-    common: NDArray[np.intp],
+    common: Rows,
     centre: Float,
     shift: Float,
     turn: float,

@@ -6,13 +6,14 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapfusion.elements import GlobalMap
-from mapfusion.export.geojson import Georeference, InvertibleGeoreference, read_geojson, write_geojson
+from mapfusion.elements import GlobalMap, MapElement
+from mapfusion.export.geojson import GeoJsonWriter, Georeference, InvertibleGeoreference, read_geojson, write_geojson
 from mapfusion.export.plane import LocalPlane, common_plane
 
 Float = NDArray[np.float64]
@@ -45,6 +46,49 @@ def write_map(
     """
     check_suffix(path)
     write_geojson(global_map, path, georeference, provenance)
+
+
+class MapWriter:
+    """Writes a map element by element; GeoJSON as they come, other formats at the end.
+
+    Use it as a context manager. An exception inside leaves no file.
+
+    Args:
+        path: file to write; its ending says the format.
+        georeference: of the metric frame.
+        provenance: what the file should tell of its origin.
+
+    Raises:
+        ValueError: an ending that stands for no format.
+    """
+
+    def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
+        check_suffix(path)
+        self._path, self._georeference, self._provenance = path, georeference, provenance
+        self._stream = (
+            GeoJsonWriter(path, georeference, provenance) if SUFFIXES[path.suffix.lower()] == "GeoJSON" else None
+        )
+        self._elements: list[MapElement] = []
+
+    def __enter__(self) -> Self:
+        if self._stream is not None:
+            self._stream.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stream is not None:
+            self._stream.__exit__(kind, error, trace)
+        elif kind is None:
+            write_map(GlobalMap(tuple(self._elements), self._provenance), self._path, self._georeference)
+
+    def write(self, element: MapElement) -> None:
+        """Append one element."""
+        if self._stream is not None:
+            self._stream.write(element)
+        else:
+            self._elements.append(element)
 
 
 def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:

@@ -132,7 +132,7 @@ def _candidates(first: Samples, second: Samples, reach: float, angle: float) -> 
     other = near[row, column].astype(np.int64)
     order = np.lexsort((distance[row, column], second.line[other], row))
     row, other = row[order].astype(np.int64), other[order]
-    nearest = np.append(True, (np.diff(row) != 0) | (np.diff(second.line[other]) != 0))
+    nearest = (np.diff(row, prepend=-1) != 0) | (np.diff(second.line[other], prepend=-1) != 0)
     row, other = row[nearest], other[nearest]
     gap = second.points[other] - first.points[row]
     tangent = second.tangents[other]

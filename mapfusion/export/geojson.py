@@ -6,10 +6,14 @@ import json
 import os
 import re
 import secrets
-from collections.abc import Mapping
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Protocol
+from types import TracebackType
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,20 +71,65 @@ def write_geojson(
         ValueError: coordinates that are not finite or not on the globe.
         OSError: the file cannot be written; a file that was there before is left as it was.
     """
-    features = [_feature(element, georeference) for element in global_map]
-    document: dict[str, Any] = {"type": "FeatureCollection"}
-    if features:
-        document["bbox"] = _bounding_box(features)
-    document["predmapnet"] = {
-        **global_map.provenance,
-        **(provenance or {}),
-        "georeference": georeference.name,
-        "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-    }
-    lines = [json.dumps(feature, separators=(",", ":"), allow_nan=False) for feature in features]
-    head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
-    body = "[\n" + ",\n".join(lines) + "\n]" if lines else "[]"
-    _write_atomically(path, f'{head},"features":{body}}}\n')
+    with GeoJsonWriter(path, georeference, {**global_map.provenance, **(provenance or {})}) as writer:
+        for element in global_map:
+            writer.write(element)
+
+
+class GeoJsonWriter:
+    """Writes elements as they come, for maps that are larger than memory, as :func:`write_geojson` does.
+
+    Use it as a context manager. An exception inside leaves no file.
+
+    Args:
+        path: file to write; an existing one is replaced.
+        georeference: of the metric frame.
+        provenance: what the file should tell of its origin.
+    """
+
+    def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
+        self._path = path
+        self._georeference = georeference
+        self._provenance = provenance
+        self._count = 0
+        self._low = np.full(2, np.inf)
+        self._high = np.full(2, -np.inf)
+
+    def __enter__(self) -> Self:
+        self._stack = ExitStack()
+        self._body = self._stack.enter_context(tempfile.TemporaryFile("w+", encoding="utf-8"))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if kind is None:
+                self._finish()
+
+    def write(self, element: MapElement) -> None:
+        """Append one element; raises ValueError for one that does not lie on the globe."""
+        feature = _feature(element, self._georeference)
+        points = _positions(feature)
+        self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))
+        self._body.write((",\n" if self._count else "\n") + json.dumps(feature, separators=(",", ":"), allow_nan=False))
+        self._count += 1
+
+    def _finish(self) -> None:
+        document: dict[str, Any] = {"type": "FeatureCollection"}
+        if self._count:
+            document["bbox"] = [*self._low.tolist(), *self._high.tolist()]
+        document["predmapnet"] = {
+            **self._provenance,
+            "georeference": self._georeference.name,
+            "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        }
+        head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
+        self._body.seek(0)
+        with write_whole(self._path) as temporary, temporary.open("w", encoding="utf-8") as file:
+            file.write(f'{head},"features":[')
+            shutil.copyfileobj(self._body, file)
+            file.write("\n]}\n" if self._count else "]}\n")
 
 
 def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
@@ -184,26 +233,19 @@ def _element(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -
     )
 
 
-def _bounding_box(features: list[dict[str, Any]]) -> list[float]:
-    points = np.concatenate(
-        [
-            np.array(
-                f["geometry"]["coordinates"][0] if f["geometry"]["type"] == "Polygon" else f["geometry"]["coordinates"]
-            )
-            for f in features
-        ]
-    )
-    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+def _positions(feature: Mapping[str, Any]) -> Float:
+    geometry = feature["geometry"]
+    return np.array(geometry["coordinates"][0] if geometry["type"] == "Polygon" else geometry["coordinates"])
 
 
-def _write_atomically(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+@contextmanager
+def write_whole(path: Path) -> Iterator[Path]:
+    """Yield a temporary name beside ``path`` that becomes the file if the block succeeds, and vanishes if not."""
+    temporary = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
     try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
+        yield temporary
+        with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
+    finally:
         temporary.unlink(missing_ok=True)
-        raise

@@ -1,0 +1,87 @@
+"""``predmapnet merge``: maps of many drives made into one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from mapfusion.merge import MergeReport
+
+
+def merge(
+    maps: Annotated[list[Path], typer.Argument(help="Maps of one city, any order; a folder stands for those in it.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write.")],
+    tile: Annotated[float, typer.Option(min=50.0, help="Side of a tile, metres; memory depends on it.")] = 200.0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
+) -> None:
+    """Merge the maps of many drives: offsets between drives taken out, evidence added up."""
+    from cli.console import out as screen
+    from cli.console import progress_display, say_warning
+    from mapfusion.io import check_suffix
+    from mapfusion.merge import merge_files
+    from mapfusion.merge_lines import MergeConfig
+    from predmapnet import __version__
+    from predmapnet.errors import UserError
+    from predmapnet.files import check_output
+
+    check_output(out)
+    try:
+        check_suffix(out)
+        paths = _files(maps, out)
+        with progress_display() as display:
+            report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    screen.print(_summary(report))
+    for line in _lines(report):
+        screen.print(line, markup=False)
+    for status in report.maps:
+        if status.note:
+            kept = "kept apart, its elements are in the map as they are" if status.apart else "merged as it lies"
+            say_warning(f"{status.name}: {kept}: {status.note}")
+    for name in report.duplicates:
+        say_warning(f"{name} is the same as another map and counts once")
+    screen.print(f"written: {out}", markup=False)
+
+
+def _files(maps: list[Path], out: Path) -> list[Path]:
+    from mapfusion.io import SUFFIXES
+    from predmapnet.errors import UserError
+
+    paths: list[Path] = []
+    for path in maps:
+        if not path.is_dir():
+            paths.append(path)
+            continue
+        inside = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES and file.suffix != ".json")
+        inside = [file for file in inside if file.absolute() != out.absolute()]
+        if not inside:
+            raise UserError(f"there is no map in the folder {path}; maps end in {', '.join(SUFFIXES)}")
+        paths.extend(inside)
+    return paths
+
+
+def _summary(report: MergeReport) -> Table:
+    from rich.table import Table
+
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("")
+    table.add_column("elements", justify="right")
+    table.add_column("metres", justify="right")
+    for label, count in report.elements.items():
+        table.add_row(label, str(count), f"{report.metres[label]:.0f}")
+    return table
+
+
+def _lines(report: MergeReport) -> list[str]:
+    aligned = [status for status in report.maps if status.partners]
+    moved = sorted(status.shift for status in aligned)
+    lines = [f"{len(report.maps)} maps in {report.tiles} tiles; {len(aligned)} aligned with others"]
+    if moved:
+        lines[0] += f", moved by {moved[len(moved) // 2]:.2f} m (median), {moved[-1]:.2f} m at most"
+    return lines

@@ -1,0 +1,215 @@
+"""Square tiles: which there are, lines cut at their sides, and the pieces put together again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import ElementKind
+
+Float = NDArray[np.float64]
+
+SEAM = 1.0
+"""Ends on the common side of two tiles that lie this close are one place, metres."""
+
+SEAM_COSINE = np.cos(np.radians(40.0))
+"""Lines go on across a side without turning more than this."""
+
+SAME_PLACE = 0.1
+"""Unless their ends are one point, to within this distance, metres."""
+
+ON_SIDE = 1e-6
+
+
+@dataclass(frozen=True, order=True)
+class Tile:
+    """A square of the plane.
+
+    Attributes:
+        row, column: its place; row counts northwards.
+        side: metres.
+    """
+
+    row: int
+    column: int
+    side: float = field(default=200.0, compare=False)
+
+    @property
+    def low(self) -> Float:
+        """Lower left corner ``(2,)``, metres."""
+        return np.array([self.column, self.row]) * self.side
+
+    @property
+    def high(self) -> Float:
+        """Upper right corner ``(2,)``, metres."""
+        return self.low + self.side
+
+    def beyond(self, point: Float) -> Tile | None:
+        """Return the neighbour on whose common side a point lies, or None for a point inside."""
+        for axis, step in ((0, (0, 1)), (1, (1, 0))):
+            if abs(point[axis] - self.high[axis]) < ON_SIDE:
+                return Tile(self.row + step[0], self.column + step[1], self.side)
+            if abs(point[axis] - self.low[axis]) < ON_SIDE:
+                return Tile(self.row - step[0], self.column - step[1], self.side)
+        return None
+
+
+def tiles_of(low: Float, high: Float, side: float) -> list[Tile]:
+    """Return the tiles that a box touches, row by row."""
+    first, last = np.floor(low / side).astype(int), np.floor(high / side).astype(int)
+    return [
+        Tile(row, column, side)
+        for row in range(int(first[1]), int(last[1]) + 1)
+        for column in range(int(first[0]), int(last[0]) + 1)
+    ]
+
+
+def cut_line(points: Float, values: Float, low: Float, high: Float) -> list[tuple[Float, Float]]:
+    """Return the parts of a line inside a box.
+
+    Args:
+        points: ``(n, 2)``, metres.
+        values: ``(n, k)``, anything that is interpolated along the line.
+        low, high: corners of the box; a line along the upper sides belongs to the next box.
+
+    Returns:
+        Pairs of points and values, in the order of the line; ends lie exactly on the box's sides.
+    """
+    inside = ((points >= low) & (points < high)).all(axis=1)
+    if inside.all():
+        return [(points, values)]
+    start, step = points[:-1], np.diff(points, axis=0)
+    at = [np.arange(len(points), dtype=np.float64)]
+    axes: list[tuple[int, float, Float]] = []
+    for axis in range(2):
+        for border in (float(low[axis]), float(high[axis])):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = (border - start[:, axis]) / step[:, axis]
+            rows = np.flatnonzero((share > 0.0) & (share < 1.0))
+            at.append(rows + share[rows])
+            axes.append((axis, border, at[-1]))
+    stations = np.unique(np.concatenate(at))
+    table = np.column_stack([points, values])
+    dense = np.stack([np.interp(stations, at[0], table[:, k]) for k in range(table.shape[1])], axis=1)
+    for axis, border, crossings in axes:
+        dense[np.searchsorted(stations, crossings), axis] = border
+    middle = (dense[1:, :2] + dense[:-1, :2]) / 2
+    within = ((middle >= low) & (middle < high)).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], within, [False]]).astype(np.int8)))
+    return [
+        (dense[first : stop + 1, :2], dense[first : stop + 1, 2:])
+        for first, stop in zip(edges[::2], edges[1::2], strict=True)
+    ]
+
+
+@dataclass
+class Piece:
+    """A line of the merged map, whole or cut at a tile's side.
+
+    Attributes:
+        kind: what it is.
+        points: ``(n, 2)``, metres.
+        values: ``(n, 2)``: variance across the line, m², and log-odds of existence.
+        observations: frames that saw it, by source.
+        first_seen, last_seen: nanoseconds.
+    """
+
+    kind: ElementKind
+    points: Float
+    values: Float
+    observations: dict[int, int]
+    first_seen: int
+    last_seen: int
+
+    def reversed(self) -> Piece:
+        """Return it run the other way."""
+        return Piece(
+            self.kind, self.points[::-1], self.values[::-1], self.observations, self.first_seen, self.last_seen
+        )
+
+    def joined(self, other: Piece) -> Piece:
+        """Return this piece with another put to its end, their common point in the middle."""
+        points = np.concatenate([self.points, other.points[1:]])
+        values = np.concatenate([self.values, other.values[1:]])
+        seam = len(self.points) - 1
+        points[seam] = (self.points[-1] + other.points[0]) / 2
+        values[seam] = (self.values[-1] + other.values[0]) / 2
+        counts = dict(self.observations)
+        for source, count in other.observations.items():
+            counts[source] = max(counts.get(source, 0), count)
+        first, last = min(self.first_seen, other.first_seen), max(self.last_seen, other.last_seen)
+        return Piece(self.kind, points, values, counts, first, last)
+
+
+class Stitcher:
+    """Takes the pieces of tile after tile, in ascending order, and gives back lines that are whole.
+
+    Holds only what ends at a side whose other tile is still to come.
+    """
+
+    def __init__(self, tiles: list[Tile]) -> None:
+        self._waiting = set(tiles)
+        self._open: list[Piece] = []
+
+    def add(self, tile: Tile, pieces: list[Piece]) -> Iterator[Piece]:
+        """Take the pieces of one tile, cut at its sides, and yield the lines that no other tile can lengthen."""
+        self._waiting.discard(tile)
+        for piece in pieces:
+            self._open.append(self._grown(tile, piece))
+        still_open = []
+        for piece in self._open:
+            if any(self._touches(piece.points[end]) for end in (0, -1)):
+                still_open.append(piece)
+            else:
+                yield piece
+        self._open = still_open
+
+    def rest(self) -> Iterator[Piece]:
+        """Yield what is left when all tiles have come."""
+        yield from self._open
+        self._open = []
+
+    def _grown(self, tile: Tile, piece: Piece) -> Piece:
+        """Join a piece to the open ones that it continues, at either end."""
+        for _ in range(2):
+            if tile.beyond(piece.points[0]) is not None:
+                best: tuple[float, int, bool] | None = None
+                for place, other in enumerate(self._open):
+                    for turned in (False, True):
+                        gap = _seam_gap(other.reversed() if turned else other, piece)
+                        if gap is not None and (best is None or gap < best[0]):
+                            best = (gap, place, turned)
+                if best is not None:
+                    other = self._open.pop(best[1])
+                    piece = (other.reversed() if best[2] else other).joined(piece)
+            piece = piece.reversed()
+        return piece
+
+    def _touches(self, point: Float) -> bool:
+        """Whether a point lies on a side of a tile that is still to come."""
+        if not self._waiting:
+            return False
+        side = next(iter(self._waiting)).side
+        low, high = np.floor((point - ON_SIDE) / side).astype(int), np.floor((point + ON_SIDE) / side).astype(int)
+        if (low == high).all():
+            return False
+        return any(Tile(row, column) in self._waiting for row in (low[1], high[1]) for column in (low[0], high[0]))
+
+
+def _seam_gap(before: Piece, after: Piece) -> float | None:
+    """Return the distance from the end of one piece to the start of another that goes on from it, else None."""
+    if before.kind is not after.kind:
+        return None
+    gap = after.points[0] - before.points[-1]
+    distance = float(np.hypot(*gap))
+    if distance > SEAM or np.abs(gap).min() > ON_SIDE:
+        return None
+    leave = before.points[-1] - before.points[max(len(before.points) - 4, 0)]
+    arrive = after.points[min(3, len(after.points) - 1)] - after.points[0]
+    size = float(np.hypot(*leave) * np.hypot(*arrive))
+    # a corner may lie on the side itself; a line beside it may not be taken for the other leg
+    straight = -0.5 if distance < SAME_PLACE else SEAM_COSINE
+    return distance if size > 0 and leave @ arrive > straight * size else None

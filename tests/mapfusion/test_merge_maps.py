@@ -1,0 +1,217 @@
+"""Several drives' maps of one place become one: poses corrected, evidence added, whatever the order and the tiles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+
+from mapfusion import ElementKind, GlobalMap, MapElement
+from mapfusion.alignment import align, landmarks, move
+from mapfusion.export.plane import LocalPlane
+from mapfusion.geometry import arc_length
+from mapfusion.io import read_map, write_map
+from mapfusion.merge import MergeConfig, merge_files, merge_maps, short_names
+from tests.mapfusion.simulation import town_road
+
+DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
+
+
+def town(seed: int = 3) -> GlobalMap:
+    truth = town_road(np.random.default_rng(seed))[0]
+    centre = np.concatenate([e.points for e in truth]).mean(axis=0)
+    return GlobalMap(tuple(replace(e, points=e.points - centre) for e in truth))
+
+
+def line(points, kind=DIVIDER, **more) -> MapElement:
+    return MapElement(
+        kind,
+        np.array(points, dtype=float),
+        **{"confidence": 0.9, "observations": 9, "first_seen": 5, "last_seen": 9, **more},
+    )
+
+
+def drive_map(truth: GlobalMap, rng, noise=0.15, offset=(0.0, 0.0), turn=0.0, drop=0.1) -> GlobalMap:
+    """What one drive might have made of the truth: each element displaced and bent, some missed, all offset."""
+    elements = []
+    for element in truth:
+        if rng.random() < drop:
+            continue
+        points = shapely.get_coordinates(shapely.segmentize(shapely.LineString(element.points), 2.0))
+        if not element.kind.is_ring and len(points) > 20:  # cut anywhere, run either way
+            start, stop = sorted(rng.integers(0, len(points), 2).tolist())
+            pieces = [points[: start + 1], points[start : stop + 1], points[stop:]]
+        else:
+            pieces = [points]
+        for piece in pieces:
+            if arc_length(piece)[-1] < 3.0:
+                continue
+            wave = np.sin(arc_length(piece) / 25.0 + rng.uniform(0, 6))[:, None] * rng.normal(0, noise / 1.4, 2)
+            moved = piece + wave + rng.normal(0, noise / 1.4, 2)
+            if element.kind.is_ring:
+                moved[-1] = moved[0]
+            moved = move(moved, np.zeros(2), np.array(offset), turn)
+            elements.append(line(moved[:: 1 if rng.random() < 0.5 or element.kind.is_ring else -1], element.kind))
+    return GlobalMap(tuple(elements))
+
+
+def samples(elements, spacing=1.0):
+    if not elements:
+        return np.empty((0, 2))
+    return np.concatenate(
+        [shapely.get_coordinates(shapely.segmentize(shapely.LineString(e.points), spacing)) for e in elements]
+    )
+
+
+def far_from(elements, truth, distance) -> float:
+    """Share of one set of lines that lies farther than a distance from another."""
+    union = shapely.union_all([shapely.LineString(e.points) for e in truth])
+    return float((shapely.distance(shapely.points(samples(elements)), union) > distance).mean())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_alignment_finds_the_offset_between_noisy_maps(seed):
+    rng = np.random.default_rng(seed)
+    truth = town(seed)
+    offset, turn = rng.uniform(-2.5, 2.5, 2), np.radians(rng.uniform(-0.8, 0.8))
+    one = landmarks(drive_map(truth, rng))
+    two = landmarks(drive_map(truth, rng, offset=offset, turn=turn))
+    found = align(two, one)
+    assert found.certain, found.refusal
+    spots = samples(truth.elements)
+    left = found.apply(move(spots, np.zeros(2), offset, turn)) - spots
+    assert np.abs(left).max() < 0.35
+    assert np.median(np.linalg.norm(left, axis=1)) < 0.15
+
+
+def test_alignment_is_refused_where_it_cannot_be_certain():
+    x = np.linspace(0, 200, 201)
+    road = GlobalMap(tuple(line(np.stack([x, np.full(201, y)], axis=1), BOUNDARY) for y in (-7.3, 6.1)))
+    shifted = GlobalMap(tuple(replace(e, points=e.points + np.array([3.0, 0.4])) for e in road))
+    assert "parallel" in align(landmarks(shifted), landmarks(road)).refusal
+    far = GlobalMap(tuple(replace(e, points=e.points + 900.0) for e in road))
+    assert "only 0 m" in align(landmarks(far), landmarks(road)).refusal
+    rng = np.random.default_rng(0)
+    other = GlobalMap(
+        tuple(line(np.stack([x, 3 * np.sin(x / 9 + rng.uniform(0, 6)) + y], axis=1), BOUNDARY) for y in (-7, 0, 7))
+    )
+    found = align(landmarks(other), landmarks(road))
+    assert not found.certain
+    assert found.disagrees
+
+
+def test_merging_drives_takes_out_their_offsets_and_half_their_noise():
+    rng = np.random.default_rng(5)
+    truth = town()
+    maps = [drive_map(truth, rng, offset=rng.normal(0, 1.0, 2), turn=np.radians(rng.normal(0, 0.2))) for _ in range(8)]
+    merged, report = merge_maps(maps)
+    assert all(status.partners >= 2 and not status.note for status in report.maps)
+    # the whole may lie off by the mean of the drives' offsets: compare after that is taken out
+    centred = align(landmarks(merged), landmarks(truth))
+    merged = GlobalMap(tuple(replace(e, points=centred.apply(e.points)) for e in merged))
+    for kind in ElementKind:
+        own, true = merged.of_kind(kind), truth.of_kind(kind)
+        assert far_from(own, true, 0.5) < 0.02, kind
+        assert far_from(true, own, 0.5) < 0.03, kind
+        assert len(own) <= 1.3 * len(true)
+        length = sum(e.length for e in own) / sum(e.length for e in true)
+        assert 0.95 < length < 1.05, (kind, length)
+    union = shapely.union_all([shapely.LineString(e.points) for e in truth.of_kind(DIVIDER)])
+    errors = shapely.distance(shapely.points(samples(merged.of_kind(DIVIDER))), union)
+    assert np.median(errors) < 0.08
+    assert all(1 < len(e.sources) <= 8 for e in merged)
+
+
+def test_the_order_of_the_maps_does_not_matter():
+    rng = np.random.default_rng(6)
+    truth = town(1)
+    maps = [drive_map(truth, rng, offset=rng.normal(0, 0.5, 2)) for _ in range(4)]
+    names = ["a", "b", "c", "d"]
+    first, _ = merge_maps(maps, names)
+    second, _ = merge_maps(maps[::-1], names[::-1])
+    assert len(first) == len(second)
+    for one, two in zip(first, second, strict=True):
+        np.testing.assert_allclose(one.points, two.points, atol=1e-6)
+        assert one.sources == two.sources
+        assert one.observations == two.observations
+
+
+def test_tiles_leave_no_seam():
+    rng = np.random.default_rng(7)
+    truth = town(2)
+    maps = [drive_map(truth, rng) for _ in range(3)]
+    whole, _ = merge_maps(maps, config=MergeConfig(tile=5000.0))
+    tiled, report = merge_maps(maps, config=MergeConfig(tile=60.0))
+    assert report.tiles > 20
+    assert len(tiled) == pytest.approx(len(whole), abs=3)
+    for kind in ElementKind:
+        assert sum(e.length for e in tiled.of_kind(kind)) == pytest.approx(
+            sum(e.length for e in whole.of_kind(kind)), rel=0.01
+        )
+        assert far_from(tiled.of_kind(kind), whole.of_kind(kind), 0.15) < 0.01
+        assert far_from(whole.of_kind(kind), tiled.of_kind(kind), 0.15) < 0.01
+
+
+def test_evidence_counts_for_and_against():
+    road = [line([[0, 0], [200, 0], [200, 80]], BOUNDARY), line([[0, 7], [193, 7], [193, 80]], BOUNDARY)]
+    paint = line([[0, 3.5], [150, 3.5]])
+    ghost = line([[40, 2.0], [80, 2.0]], confidence=0.6)
+    maps = [GlobalMap((*road, paint, *([ghost] if i == 0 else []))) for i in range(3)]
+    maps = [GlobalMap(tuple(replace(e, points=e.points + 0.01 * i) for e in m)) for i, m in enumerate(maps)]
+    merged, _ = merge_maps(maps)
+    assert len(merged.of_kind(DIVIDER)) == 1
+    (divider,) = merged.of_kind(DIVIDER)
+    assert divider.observations == 27
+    assert divider.confidence > paint.confidence
+    sharp = replace(paint, deviation=np.full(2, 0.05), points=paint.points + np.array([0.0, 0.3]))
+    blunt = replace(paint, deviation=np.full(2, 0.5))
+    merged, _ = merge_maps([GlobalMap((*road, sharp)), GlobalMap((*road, blunt))])
+    (divider,) = merged.of_kind(DIVIDER)
+    assert np.median(divider.points[:, 1]) == pytest.approx(3.79, abs=0.02)
+
+
+def test_double_lines_stay_double_and_cut_lines_become_one():
+    road = [line([[0, y], [160, y]], BOUNDARY) for y in (-7, 7)]
+    double = [line([[0, y], [160, y]]) for y in (-0.15, 0.15)]
+    cut = [
+        line([[0, -0.1], [90, -0.1]]),
+        line([[60, 0.12], [160, 0.12]]),
+        line([[90.5, -0.12], [160, -0.12]]),
+        line([[60, 0.12], [0, 0.12]]),
+    ]
+    merged, _ = merge_maps([GlobalMap((*road, *double)), GlobalMap((*road, *cut))])
+    assert len(merged.of_kind(DIVIDER)) == 2
+    # each map saw a half: together a whole, in one piece
+    halves = [GlobalMap((line([[0, 0], [100, 0.2]], BOUNDARY),)), GlobalMap((line([[80, 0.0], [200, 0.0]], BOUNDARY),))]
+    merged, report = merge_maps(halves)
+    (boundary,) = merged.of_kind(BOUNDARY)
+    assert boundary.length == pytest.approx(200.0, abs=1.0)
+    assert all("common ground" in status.note for status in report.maps)
+
+
+def test_files_merge_with_provenance_and_a_copy_counts_once(tmp_path):
+    rng = np.random.default_rng(8)
+    plane, truth = LocalPlane(8.41, 49.01), town(1)
+    maps = [drive_map(truth, rng) for _ in range(2)]
+    paths = [tmp_path / name / "map.geojson" for name in ("log-1", "log-2", "copy")]
+    for path, global_map in zip(paths, [*maps, maps[0]], strict=True):
+        path.parent.mkdir()
+        write_map(global_map, path, plane)
+    report = merge_files(paths, tmp_path / "city.geojson", jobs=2)
+    assert len(report.duplicates) == 1
+    city = read_map(tmp_path / "city.geojson", plane)
+    assert sum(report.elements.values()) == len(city)
+    assert city.provenance["sources"] == ["copy/map", "log-1/map", "log-2/map"]
+    assert any(len(e.sources) == 2 for e in city)
+    expected, _ = merge_maps(maps)
+    assert city.length(BOUNDARY) == pytest.approx(expected.length(BOUNDARY), rel=0.01)
+
+
+def test_names_tell_files_apart(tmp_path):
+    a, b = tmp_path / "a" / "map.geojson", tmp_path / "b" / "map.geojson"
+    assert short_names([a, b]) == ["a/map", "b/map"]
+    assert short_names([a]) == ["map"]
+    with pytest.raises(ValueError, match="twice"):
+        short_names([a, a])
