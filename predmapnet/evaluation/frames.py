@@ -29,7 +29,7 @@ class EvaluationFrame:
         truth: ground truth of the same ROI, in the ego frame, not simplified.
 
     Raises:
-        UserError: a polyline is empty or not finite, a score is not finite, or a kind does not exist; the
+        UserError: a polyline is empty or not finite, a forecast or a score is not finite, or a kind does not exist; the
             message names the scene, the frame and the element.
     """
 
@@ -42,6 +42,9 @@ class EvaluationFrame:
         where = f"Scene {self.scene}, frame {self.index}"
         _check_elements(f"{where}, prediction", self.predicted.kinds, self.predicted.polylines)
         _check_elements(f"{where}, ground truth", self.truth.kinds, self.truth.polylines)
+        for row, points in enumerate(self.predicted.forecasts or ()):
+            if not np.isfinite(points).all():
+                raise UserError(f"{where}, forecast {row}: the polyline holds NaN or infinite coordinates.")
         bad = np.flatnonzero(~np.isfinite(self.predicted.scores))
         if len(bad):
             score = self.predicted.scores[bad[0]]

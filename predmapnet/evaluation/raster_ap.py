@@ -3,7 +3,7 @@
 Each element is drawn at 8 pixels per metre (lines one pixel wide, crossings filled) and dilated by a 5 x 5 square.
 Predictions below a score of 0.05 are dropped and at most the best 100 of a kind and frame count. Matching and
 averaging follow COCO: a prediction takes the best truth that is still free, AP is the mean precision at 101 recalls.
-The ground truth is not simplified.
+The ground truth is not simplified. Nothing is drawn of a line of a single point, so it overlaps with nothing.
 """
 
 from __future__ import annotations

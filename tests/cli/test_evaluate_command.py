@@ -123,6 +123,16 @@ def test_truth_is_kept_and_used_again(predmapnet, tiny_root, tmp_path):
     assert len(contents) == 1
 
 
+def test_nan_in_a_submission_names_frame_and_element(predmapnet, tiny_root, tmp_path):
+    scene, maps = truth_as_results(tiny_root, "scene-0001")
+    vectors = [line.tolist() for line in maps[2].polylines]
+    vectors[1][0][1] = float("nan")
+    entry = {"vectors": vectors, "scores": maps[2].scores.tolist(), "labels": maps[2].kinds.tolist()}
+    (tmp_path / "submission.json").write_text(json.dumps({"results": {scene.frame(2).token: entry}}))
+    result = predmapnet("evaluate", tmp_path / "submission.json", "--data-root", tiny_root)
+    assert result.code == 2 and "Scene scene-0001, frame 2, prediction 1" in " ".join(result.err.split()), result.err
+
+
 def test_frames_of_another_data_set_are_named(predmapnet, tiny_root, tmp_path):
     entry = {"vectors": [], "scores": [], "labels": []}
     known = NuScenesSource(tiny_root).open("scene-0001").frame(0).token
