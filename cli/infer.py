@@ -12,7 +12,7 @@ from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Threads,
 
 def infer(
     scene: Annotated[str, typer.Argument(help="Name of the scene; `predmapnet scenes` lists them.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write (GeoJSON).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
     save_frames: Annotated[Path | None, typer.Option(help="What each frame showed, to write (Parquet).")] = None,
     dataset: Dataset = None,

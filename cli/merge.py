@@ -18,10 +18,12 @@ def merge(
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write.")],
     tile: Annotated[float, typer.Option(min=50.0, help="Side of a tile, metres; memory depends on it.")] = 200.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
+    style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
 ) -> None:
     """Merge the maps of many drives: offsets between drives taken out, evidence added up."""
     from cli.console import out as screen
     from cli.console import progress_display, say_warning
+    from mapfusion.export.qgis_style import write_styles
     from mapfusion.io import check_suffix
     from mapfusion.merge import merge_files
     from mapfusion.merge_lines import MergeConfig
@@ -46,7 +48,8 @@ def merge(
             say_warning(f"{status.name}: {kept}: {status.note}")
     for name in report.duplicates:
         say_warning(f"{name} is the same as another map and counts once")
-    screen.print(f"written: {out}", markup=False)
+    written = [out, *(write_styles(out) if style else ())]
+    screen.print("\n".join(f"written: {path}" for path in written), markup=False)
 
 
 def _files(maps: list[Path], out: Path) -> list[Path]:
@@ -58,8 +61,12 @@ def _files(maps: list[Path], out: Path) -> list[Path]:
         if not path.is_dir():
             paths.append(path)
             continue
-        inside = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES and file.suffix != ".json")
-        inside = [file for file in inside if file.absolute() != out.absolute()]
+        endings = set(SUFFIXES) - {".json"}  # summaries and other things are JSON, too
+        inside = [
+            file
+            for file in sorted(path.rglob("*"))
+            if file.suffix.lower() in endings and not file.name.startswith(".") and file.absolute() != out.absolute()
+        ]
         if not inside:
             raise UserError(f"there is no map in the folder {path}; maps end in {', '.join(SUFFIXES)}")
         paths.extend(inside)

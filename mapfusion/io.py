@@ -13,12 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, MapElement
+from mapfusion.export.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
 from mapfusion.export.geojson import GeoJsonWriter, Georeference, InvertibleGeoreference, read_geojson, write_geojson
+from mapfusion.export.lanelet import read_lanelet, write_lanelet
 from mapfusion.export.plane import LocalPlane, common_plane
 
 Float = NDArray[np.float64]
 
-SUFFIXES = {".geojson": "GeoJSON", ".json": "GeoJSON"}
+SUFFIXES = {
+    ".geojson": "GeoJSON",
+    ".json": "GeoJSON",
+    ".gpkg": "GeoPackage",
+    ".fgb": "FlatGeobuf",
+    ".osm": "Lanelet2",
+}
 """Endings of the files that hold maps, and what each is."""
 
 
@@ -45,7 +53,13 @@ def write_map(
         OSError: the file cannot be written.
     """
     check_suffix(path)
-    write_geojson(global_map, path, georeference, provenance)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            write_geodatabase(global_map, path, georeference, provenance)
+        case "Lanelet2":
+            write_lanelet(global_map, path, georeference, provenance)
+        case _:
+            write_geojson(global_map, path, georeference, provenance)
 
 
 class MapWriter:
@@ -103,7 +117,13 @@ def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> 
         OSError: the file cannot be read.
     """
     check_suffix(path)
-    return read_geojson(path, georeference)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            return read_geodatabase(path, georeference)
+        case "Lanelet2":
+            return read_lanelet(path, georeference)
+        case _:
+            return read_geojson(path, georeference)
 
 
 def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
@@ -127,10 +147,16 @@ def read_box(path: Path) -> Float | None:
         ValueError, OSError: as :func:`read_map`.
     """
     check_suffix(path)
-    with path.open(encoding="utf-8") as file:
-        head = file.read(512)
-    found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
-    box = json.loads(found[1]) if found else _box_of_points(path)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            box = geodatabase_box(path)
+        case "Lanelet2":
+            box = _box_of_points(path)
+        case _:
+            with path.open(encoding="utf-8") as file:
+                head = file.read(512)
+            found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
+            box = json.loads(found[1]) if found else _box_of_points(path)
     if box is None:
         return None
     if len(box) != 4 or not np.isfinite(box).all():

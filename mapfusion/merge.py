@@ -125,7 +125,7 @@ _shelf: _Shelf
 
 
 def _start_worker(
-    maps: Sequence[Path], plane: InvertibleGeoreference | None, corrections: dict[int, Correction]
+    maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None, corrections: dict[int, Correction]
 ) -> None:
     global _shelf
     _shelf = _Shelf(maps, plane)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapfusion.io import check_suffix
 from predmapnet.errors import UserError
 from predmapnet.files import check_output
 
@@ -14,7 +15,7 @@ class Outputs:
     """Where a run writes; None for what is not wanted.
 
     Attributes:
-        map: GeoJSON.
+        map: GeoJSON, GeoPackage, FlatGeobuf or Lanelet2, by its ending.
         recording: Rerun recording.
         frames: Parquet file of what each frame showed.
     """
@@ -34,3 +35,8 @@ class Outputs:
             check_output(path)
         if len({path.absolute() for path in self.paths}) < len(self.paths):
             raise UserError("two outputs have the same name; give each its own")
+        if self.map is not None:
+            try:
+                check_suffix(self.map)
+            except ValueError as error:
+                raise UserError(str(error)) from error

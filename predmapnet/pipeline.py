@@ -14,8 +14,9 @@ import rerun as rr
 import torch
 
 import predmapnet
+from mapfusion.coverage import observed_rings
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
-from mapfusion.export.geojson import write_geojson
+from mapfusion.io import write_map
 from predmapnet.datasets.demo import DemoSource
 from predmapnet.datasets.selection import open_source
 from predmapnet.datasets.source import Progress, Scene, SceneSource
@@ -24,7 +25,6 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, threshol
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.frames_io import FrameWriter
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
-from predmapnet.files import write_whole
 from predmapnet.mapper import Mapper
 from predmapnet.outputs import Outputs
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
@@ -166,8 +166,9 @@ class MappingPipeline:
                 observers.append(_ProgressObserver(progress))
             run = map_scene(scene, self.mapper, observers, self._allow_missing_cameras)
             if outputs.map is not None:
-                with write_whole(outputs.map) as temporary:
-                    write_geojson(run.global_map, temporary, georeference, provenance)
+                seen = seen_area([frame.ego_to_global for frame in run.frames], self.mapper.roi)
+                observed = observed_rings(seen, georeference)
+                write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
             if outputs.frames is not None:
                 with FrameWriter(outputs.frames, provenance) as writer:
                     for frame, frame_map in zip(run.frames, run.frame_maps, strict=True):

@@ -8,7 +8,7 @@ import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -109,7 +109,7 @@ class GeoJsonWriter:
 
     def write(self, element: MapElement) -> None:
         """Append one element; raises ValueError for one that does not lie on the globe."""
-        feature = _feature(element, self._georeference)
+        feature = feature_of(element, self._georeference)
         points = _positions(feature)
         self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))
         self._body.write((",\n" if self._count else "\n") + json.dumps(feature, separators=(",", ":"), allow_nan=False))
@@ -153,16 +153,31 @@ def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None)
         raise ValueError(f"{path}: not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise ValueError(f"{path}: not a GeoJSON FeatureCollection")
+    elements = elements_of(document.get("features", []), georeference, document.get("bbox"), path)
+    return GlobalMap(elements, document.get("predmapnet", {}))
+
+
+def elements_of(
+    features: Iterable[Mapping[str, Any]],
+    georeference: InvertibleGeoreference | None,
+    box: Sequence[float] | None,
+    path: Path,
+) -> tuple[MapElement, ...]:
+    """Return the elements of features; without a georeference in metres about the middle of ``box`` (degrees).
+
+    Raises:
+        ValueError: a feature is not an element; says which, and in which file.
+    """
     if georeference is None:
-        box = document.get("bbox", [0.0, 0.0, 0.0, 0.0])
-        georeference = LocalPlane((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
+        west, south, east, north = box or (0.0, 0.0, 0.0, 0.0)
+        georeference = LocalPlane((west + east) / 2, (south + north) / 2)
     elements = []
-    for position, feature in enumerate(document.get("features", [])):
+    for position, feature in enumerate(features):
         try:
-            elements.append(_element(feature, georeference))
+            elements.append(element_of(feature, georeference))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise ValueError(f"{path}: feature {position} is not an element of a map: {error!r}") from error
-    return GlobalMap(tuple(elements), document.get("predmapnet", {}))
+    return tuple(elements)
 
 
 def format_timestamp(nanoseconds: int) -> str:
@@ -180,7 +195,8 @@ def parse_timestamp(text: str) -> int:
     return (moment.days * 86_400 + moment.seconds) * 1_000_000_000 + int(match[2])
 
 
-def _feature(element: MapElement, georeference: Georeference) -> dict[str, Any]:
+def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any]:
+    """Return an element as a GeoJSON feature: what every format writes. Raises ValueError off the globe."""
     degrees = np.round(georeference.to_wgs84(element.points), DECIMALS)
     if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
         raise ValueError(f"a {element.kind.label} lies outside the globe: the georeference does not fit the map")
@@ -212,7 +228,8 @@ def _feature(element: MapElement, georeference: Georeference) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _element(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -> MapElement:
+def element_of(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -> MapElement:
+    """Return the element that :func:`feature_of` made a feature of; raises KeyError, TypeError or ValueError."""
     properties, geometry = feature["properties"], feature["geometry"]
     kind = ElementKind[properties["kind"].upper()]
     expected = "Polygon" if kind.is_ring else "LineString"

@@ -49,7 +49,7 @@ class LocalPlane:
         root = math.sqrt(1.0 - WGS84_ECCENTRICITY_SQUARED * sine**2)
         meridian = WGS84_SEMI_MAJOR_AXIS * (1.0 - WGS84_ECCENTRICITY_SQUARED) / root**3
         parallel = WGS84_SEMI_MAJOR_AXIS / root * math.cos(math.radians(self.latitude))
-        return np.radians(np.array([parallel, meridian]))
+        return np.asarray(np.radians(np.array([parallel, meridian])))
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres to ``(n, 2)`` longitude and latitude, degrees."""

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
+from mapfusion.io import read_map
 from tests.cli.tiny_nuscenes import edit_table, image_path, write_tiny_nuscenes
 
 
@@ -25,7 +26,7 @@ def infer(predmapnet, random_weights, tiny_root):
 
 
 def leftovers(folder: Path) -> list[str]:
-    return [path.name for path in folder.rglob("*") if path.name.endswith(".part")]
+    return [path.name for path in folder.rglob("*") if ".part" in path.name]
 
 
 def mapping_began(folder: Path) -> bool:
@@ -194,3 +195,22 @@ def test_ctrl_c_says_one_line_and_leaves_nothing(random_weights, tmp_path):
     assert said.count("stopped") == 1
     assert "Traceback" not in said
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["map.gpkg", "map.fgb", "map.osm"])
+def test_the_ending_chooses_the_format(infer, tmp_path, name):
+    assert infer("scene-0001", "--out", name).code == 0
+    assert infer("scene-0001", "--out", "map.geojson").code == 0
+    written, expected = read_map(tmp_path / name), read_map(tmp_path / "map.geojson")
+    assert len(written) == len(expected) > 0
+    for one, two in zip(written, expected, strict=True):
+        assert one.kind is two.kind
+        assert abs(one.length - two.length) < 0.01
+    assert written.provenance["observed"] == expected.provenance["observed"]
+    assert len(written.provenance["observed"][0]) >= 5
+
+
+def test_an_unknown_ending_is_told_before_the_work_begins(infer):
+    result = infer("no-such-scene", "--out", "map.shp")
+    assert result.code == 2
+    assert "stands for no map format" in result.err

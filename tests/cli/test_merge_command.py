@@ -6,7 +6,7 @@ import numpy as np
 
 from mapfusion import ElementKind, GlobalMap, MapElement
 from mapfusion.export.plane import LocalPlane
-from mapfusion.io import write_map
+from mapfusion.io import read_map, write_map
 
 PLANE = LocalPlane(8.4, 49.0)
 
@@ -43,8 +43,10 @@ def test_a_folder_of_maps_becomes_one(predmapnet, tmp_path):
 def test_what_could_not_be_aligned_is_said(predmapnet, tmp_path):
     write_map(street(), tmp_path / "here.geojson", PLANE)
     write_map(street((700.0, 0.0)), tmp_path / "there.geojson", PLANE)
-    result = predmapnet("merge", "here.geojson", "there.geojson", "-o", "city.geojson")
+    result = predmapnet("merge", "here.geojson", "there.geojson", "-o", "city.gpkg", "--style")
     assert result.code == 0
+    assert len(read_map(tmp_path / "city.gpkg")) == 6
+    assert (tmp_path / "city.lines.qml").exists()
     assert "here: merged as it lies: no other map of this place" in result.err
 
 
