@@ -19,7 +19,7 @@ from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
-from predmapnet.datasets.poses import pose_matrix
+from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
@@ -75,11 +75,14 @@ class NuScenesSource:
         version: name of the table folder that is read.
         synthetic: whether its images were rendered, as the demo world's marker file says.
         split_scheme: ``old`` or ``new``.
+        keep_corners: whether crossings keep the corners of the region.
     """
 
     name = "nuscenes"
 
-    def __init__(self, root: Path, version: str | None = None, split_scheme: str = "old") -> None:
+    def __init__(
+        self, root: Path, version: str | None = None, split_scheme: str = "old", keep_corners: bool = False
+    ) -> None:
         """Find the tables; nothing is read yet.
 
         Args:
@@ -87,6 +90,8 @@ class NuScenesSource:
             version: table folder; None takes v1.0-trainval if it is there, v1.0-mini only if nothing else is.
             split_scheme: ``old`` (the data set's own; v1.0-mini has one of its own) or ``new`` (StreamMapNet's
                 geographically disjoint one).
+            keep_corners: of crossings in the ground truth, which the official code may lose; see
+                :class:`~predmapnet.datasets.ground_truth.NuScenesGroundTruth`. Rendered towns always keep them.
 
         Raises:
             UserError: nothing to open, or no such scheme.
@@ -96,6 +101,7 @@ class NuScenesSource:
         self.version = choose_version(self.root, version)
         check_scheme(split_scheme)
         self.split_scheme = split_scheme
+        self.keep_corners = keep_corners or self.synthetic
         self.tables = Tables(self.root / self.version)
         self._maps: dict[str, NuScenesGroundTruth | None] = {}
 
@@ -164,7 +170,7 @@ class NuScenesSource:
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
         if location not in self._maps:
             path = self.root / "maps" / "expansion" / f"{location}.json"
-            self._maps[location] = NuScenesGroundTruth(path) if path.is_file() else None
+            self._maps[location] = NuScenesGroundTruth(path, self.keep_corners) if path.is_file() else None
         return self._maps[location]
 
 
@@ -279,7 +285,7 @@ class NuScenesScene:
             raise IndexError(f"{self.info.name} has {len(self._frames)} frames, not a frame {index}")
         ego_to_global, lidar_to_ego = self._poses(index)
         shifted_to_global = ego_to_global.copy()
-        shifted_to_global[:2, 3] = (ego_to_global @ lidar_to_ego)[:2, 3]
+        shifted_to_global[:2, 3] = combined(ego_to_global, lidar_to_ego)[:2, 3]
         return Instant(self._frames[index].token, self._frames[index].timestamp, shifted_to_global)
 
     def frame(self, index: int) -> Frame:
@@ -328,7 +334,7 @@ class NuScenesScene:
     def lidar_to_global(self, index: int) -> Float:
         """Pose of the lidar in frame ``index``, ``(4, 4) float64``; the official ground truth hangs on it."""
         ego_to_global, lidar_to_ego = self._poses(index)
-        return ego_to_global @ lidar_to_ego
+        return combined(ego_to_global, lidar_to_ego)
 
     def lidar_path(self, index: int) -> Path | None:
         """Where the lidar sweep of frame ``index`` lies, or None if the file is not there."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
+_UNIT_TOLERANCE = 1e-14
 
 
 def rotation_matrix(quaternion: Float) -> Float:
@@ -22,13 +24,44 @@ def rotation_matrix(quaternion: Float) -> Float:
     Returns:
         ``(..., 3, 3) float64``.
     """
-    w, x, y, z = np.moveaxis(quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True), -1, 0)
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    square = w * w + x * x + y * y + z * z
+    # Order and grouping of the operations are those of the reader that the official data sets use. Their ground truth
+    # depends on the last bits of poses, so nothing here may go through a matrix product, whose bits vary by machine.
+    length = np.where(np.abs(1.0 - square) < _UNIT_TOLERANCE, 1.0, np.sqrt(square))
+    w, x, y, z = w / length, x / length, y / length, z / length
+    left = ((x, w, -z, y), (y, z, w, -x), (z, -y, x, w))
+    right = ((x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
     rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        [row[0] * column[0] + row[1] * column[1] + row[2] * column[2] + row[3] * column[3] for column in right]
+        for row in left
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_of(rotation: Float) -> Float:
+    """Unit quaternion ``(4,)`` (w, x, y, z) of a rotation matrix ``(3, 3)``, signed as by the official reader."""
+    ((a, b, c), (d, e, f), (g, h, i)) = rotation.tolist()
+    if i < 0:
+        if a > e:
+            square = 1 + a - e - i
+            parts = (h - f, square, d + b, c + g)
+        else:
+            square = 1 - a + e - i
+            parts = (c - g, d + b, square, h + f)
+    elif a < -e:
+        square = 1 - a - e + i
+        parts = (d - b, c + g, h + f, square)
+    else:
+        square = 1 + a + e + i
+        parts = (square, h - f, c - g, d - b)
+    return np.array(parts) * (0.5 / math.sqrt(square))
+
+
+def combined(outer: Float, inner: Float) -> Float:
+    """``outer @ inner`` of two poses ``(4, 4)``, with the same bits on every machine."""
+    terms = outer[:, :, None] * inner[None, :, :]
+    return np.asarray(((terms[:, 0] + terms[:, 1]) + terms[:, 2]) + terms[:, 3])
 
 
 def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], where: str) -> Float:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from mapfusion import geometry
 from mapfusion.elements import RegionOfInterest
+from predmapnet.datasets import poses as poses_module
 from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
 
@@ -36,7 +37,7 @@ def code_fingerprint() -> bytes:
     digest = hashlib.sha256(
         f"numpy {np.__version__} shapely {shapely.__version__} geos {shapely.geos_version}".encode()
     )
-    for path in (*sorted(Path(__file__).parent.glob("*.py")), Path(geometry.__file__)):
+    for path in (*sorted(Path(__file__).parent.glob("*.py")), Path(geometry.__file__), Path(poses_module.__file__)):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.digest()
 

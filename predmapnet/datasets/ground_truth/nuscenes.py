@@ -23,13 +23,14 @@ from predmapnet.datasets.ground_truth.patch import (
     area_rings,
     crossing_contours,
     cut_rings,
-    keep_corners,
     midpoint,
     nearest_rows,
     parts_of_type,
     patch_polygon,
+    restored_corners,
     rotation_about,
 )
+from predmapnet.datasets.poses import quaternion_of, rotation_matrix
 from predmapnet.datasets.source import FrameTruth
 from predmapnet.demo_world.world import VectorMap
 from predmapnet.errors import UserError
@@ -47,19 +48,24 @@ class NuScenesGroundTruth:
         dividers: road dividers, then lane dividers, in file order (empty lines stay, for their index).
         crossings: pieces of pedestrian crossings in file order.
         road_segments, lanes: drivable surface in file order.
-        fingerprint: digest of the map that this was made from.
+        fingerprint: digest of all that this was made from.
+        keep_corners: whether crossings over a corner of the region keep it.
     """
 
-    def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
+    def __init__(self, map_file: Path | Mapping[str, Any], keep_corners: bool = False) -> None:
         """Read a map.
 
         Args:
             map_file: ``maps/expansion/<location>.json``, or its content.
+            keep_corners: False does as the official code, in which a crossing that lies over a corner of the region
+                loses that corner in some frames, by the last bits of the pose; True keeps all corners.
 
         Raises:
             UserError: the file is missing, damaged, or not a map expansion.
         """
-        content, self.fingerprint = read_map(map_file)
+        content, digest = read_map(map_file)
+        self.keep_corners = keep_corners
+        self.fingerprint = digest + bytes([keep_corners])
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
             nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
@@ -83,8 +89,12 @@ class NuScenesGroundTruth:
 
     @classmethod
     def from_vector_map(cls, vector_map: VectorMap) -> NuScenesGroundTruth:
-        """Take a map of the demo world as it is, without files; road dividers come before lane dividers."""
+        """Take a map of the demo world as it is, without files; road dividers come before lane dividers.
+
+        No official figures depend on it, so crossings keep their corners.
+        """
         truth = cls.__new__(cls)
+        truth.keep_corners = True
         by_direction = sorted(vector_map.dividers, key=lambda divider: not divider.opposite)
         truth._index(
             dividers=[LineString(divider.points) for divider in by_direction],
@@ -126,7 +136,9 @@ class NuScenesGroundTruth:
             source element carry the same id.
         """
         centre = (float(lidar_to_global[0, 3]), float(lidar_to_global[1, 3]))
-        angle = math.atan2(lidar_to_global[1, 0], lidar_to_global[0, 0]) / math.pi * 180
+        # The official code hands the pose on as a quaternion; its last bits decide about corners of crossings.
+        rotation = rotation_matrix(quaternion_of(lidar_to_global[:3, :3]))
+        angle = math.atan2(rotation[1, 0], rotation[0, 0]) / math.pi * 180
         patch = patch_polygon(centre, roi.width, roi.length, angle)
         place = _Place(centre, rotation_about(-angle, centre))
         box = shapely.box(-roi.width / 2, -roi.length / 2, roi.width / 2, roi.length / 2)
@@ -185,8 +197,10 @@ class NuScenesGroundTruth:
         contours, ids = [], []
         merged = merge_crossings(pieces)
         insides = shapely.point_on_surface(np.asarray(pieces, dtype=object))
-        restored = keep_corners(merged, crossing_contours(merged, box), box)
-        for polygon, contour in zip(merged, restored, strict=True):
+        outlines = crossing_contours(merged, box)
+        if self.keep_corners:
+            outlines = restored_corners(merged, outlines, box)
+        for polygon, contour in zip(merged, outlines, strict=True):
             if contour is not None:
                 contours.append(contour)
                 members = np.flatnonzero(shapely.dwithin(polygon, insides, 1e-6))

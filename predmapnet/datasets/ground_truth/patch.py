@@ -80,13 +80,12 @@ def crossing_contours(polygons: Sequence[Polygon], box: Polygon) -> list[Float |
     return [_closed_contour(cut) for cut in shapely.intersection(rings, box)]
 
 
-def keep_corners(polygons: Sequence[Polygon], contours: Sequence[Float | None], box: Polygon) -> list[Float | None]:
+def restored_corners(polygons: Sequence[Polygon], contours: Sequence[Float | None], box: Polygon) -> list[Float | None]:
     """Restore contours that lost the corner of the region to rounding.
 
     Crossings that were cut by the region in one frame and turned into another have their cut edges on its border up
     to rounding. Edges that come out just outside are lost when the ring is cut again; two of them take the corner of
-    the region with them. The official code loses corners in the same way, by the last bits of its own arithmetic; no
-    other computation can lose exactly the same ones.
+    the region with them. The official code loses corners in this way.
     """
     return [
         contour

@@ -15,7 +15,7 @@ from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.raster import semantic_mask
 from predmapnet.datasets.ground_truth.vectors import normalised, permuted, resampled, simplified
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.datasets.poses import pose_matrix
+from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of
 from predmapnet.datasets.splits import split_names
 
 pytestmark = pytest.mark.reference
@@ -48,7 +48,16 @@ def unstable_items(path):
 
 def lidar_to_global(frame):
     ego_to_global = pose_matrix(frame["e2g_rotation"], frame["e2g_translation"], "fixture")
-    return ego_to_global @ pose_matrix(frame["lidar2ego_rotation"], frame["lidar2ego_translation"], "fixture")
+    return combined(ego_to_global, pose_matrix(frame["lidar2ego_rotation"], frame["lidar2ego_translation"], "fixture"))
+
+
+def test_poses_have_the_bits_of_the_official_ones(reference):
+    """Corners of crossings hang on them."""
+    for path in sorted(reference("ground_truth", "nuscenes", "gt").glob("*.gt.json")):
+        for frame in json.loads(path.read_text())["frames"]:
+            ours = lidar_to_global(frame)
+            assert ours[:3, 3].tolist() == frame["lidar2global_translation"]
+            assert quaternion_of(ours[:3, :3]).tolist() == frame["lidar2global_quaternion"]
 
 
 def argoverse2_cases(folder):

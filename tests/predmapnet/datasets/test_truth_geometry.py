@@ -14,7 +14,7 @@ from predmapnet.datasets.ground_truth.lane_dividers import LaneSide, chained, co
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.vectors import normalised, permuted
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines, truth_map
-from predmapnet.datasets.poses import pose_matrix, rotation_matrix
+from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of, rotation_matrix
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 from predmapnet.errors import UserError
 
@@ -229,6 +229,32 @@ def test_rotation_matrices_are_rotations(quaternion):
     rotation = rotation_matrix(np.array(quaternion))
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
+    back = quaternion_of(rotation)
+    unit = np.array(quaternion) / np.linalg.norm(quaternion)
+    np.testing.assert_allclose(back * np.sign(back @ unit), unit, atol=1e-9)
+
+
+def test_combining_poses_is_their_product():
+    first, second = (pose_matrix([np.cos(a), 0, 0, np.sin(a)], [a, 2, 3], "here") for a in (0.3, 1.7))
+    np.testing.assert_allclose(combined(first, second), first @ second, atol=1e-12)
+
+
+def test_corners_are_lost_as_officially_unless_they_are_to_be_kept(small_map):
+    """A crossing over the corner of the region: some poses lose the corner by rounding, none if it is kept."""
+    official, keeping = NuScenesGroundTruth(small_map), NuScenesGroundTruth(small_map, keep_corners=True)
+    assert official.fingerprint != keeping.fingerprint
+    areas = {False: [], True: []}
+    for yaw in np.linspace(0.3, 0.9, 60):
+        pose = lidar_pose(
+            101.5 - 29.5 * np.cos(yaw) + 14.5 * np.sin(yaw), 4 - 29.5 * np.sin(yaw) - 14.5 * np.cos(yaw), yaw
+        )
+        for truth in (official, keeping):
+            frame = truth.frame(pose, ROI)
+            areas[truth.keep_corners].append(
+                sum(Polygon(frame.polylines[row]).area for row in np.flatnonzero(frame.kinds == 0))
+            )
+    lost = np.array(areas[True]) - np.array(areas[False])
+    assert (lost > -1e-6).all() and (lost > 1e-3).any() and (lost < 1e-6).any()
 
 
 def test_a_quaternion_turns_the_right_way():
