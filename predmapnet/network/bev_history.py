@@ -65,17 +65,18 @@ def warp_grid(current_to_past: Tensor, config: MapTrackerConfig) -> Tensor:
         ``(..., H, W, 2) float32``, as ``grid_sample`` wants it: -1 and 1 are the borders of the map, y downwards.
     """
     cells = _cells(config, current_to_past.device)
-    size = cells.new_tensor([config.roi_length, config.roi_width])
     rotation, translation = current_to_past[..., :2, :2], current_to_past[..., :2, 3]
-    past = (cells * size).flatten(0, 1) @ rotation.transpose(-1, -2) + translation[..., None, :]
-    past = past.float() / (size.float() / 2) * cells.new_tensor([1.0, -1.0]).float()
-    return past.unflatten(-2, cells.shape[:2])
+    past = cells.flatten(0, 1) @ rotation.transpose(-1, -2) + translation[..., None, :]
+    half = past.new_tensor([config.roi_length / 2, -config.roi_width / 2]).float()
+    return (past.float() / half).unflatten(-2, cells.shape[:2])
 
 
 def _cells(config: MapTrackerConfig, device: torch.device) -> Tensor:
-    """Return the positions ``(H, W, 2) float64`` that are looked up, -0.5 to 0.5 over the ROI."""
-    if config.quirks.endpoint_warp_grid:  # Released weights saw every past map zoomed by this.
-        x = torch.linspace(-0.5, 0.5, config.columns, dtype=torch.float64, device=device)
-        y = torch.linspace(0.5, -0.5, config.rows, dtype=torch.float64, device=device)
-        return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
-    return cell_centres(config.rows, config.columns, device).double() - 0.5
+    """Return the positions ``(H, W, 2) float64`` that are looked up, metres in the current ego frame."""
+    length, width = config.roi_length, config.roi_width
+    if config.quirks.endpoint_warp_grid:  # Released weights saw every past map zoomed by this, rounded to 32 bits.
+        x = torch.linspace(-length / 2, length / 2, config.columns, dtype=torch.float32, device=device)
+        y = torch.linspace(width / 2, -width / 2, config.rows, dtype=torch.float32, device=device)
+        return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).double()
+    normalised = cell_centres(config.rows, config.columns, device).double()
+    return (normalised - 0.5) * normalised.new_tensor([length, width])

@@ -1,0 +1,279 @@
+"""Parts of the baseline against plain twins, and rules that need no fixtures."""
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from predmapnet.network.bev_history import warp_grid
+from predmapnet.network.camera_pillars import make_camera_pillars
+from predmapnet.network.deformable_attention import deformable_attention
+from predmapnet.network.deformable_convolution import DeformableConvolution
+from predmapnet.network.history_choice import choose_history
+from predmapnet.network.interface import FrameInputs
+from predmapnet.network.maptracker import MapTracker, MapTrackerState, move_on_ground, select_tracks
+from predmapnet.network.maptracker_config import MapTrackerConfig, MapTrackerQuirks
+from predmapnet.network.normalised_convolution import NormalisedConvolution
+from predmapnet.network.rigid_motion import invert_pose, quaternion
+
+SMALL = MapTrackerConfig(
+    rows=10,
+    columns=20,
+    bev_width=32,
+    bev_heads=4,
+    bev_hidden=32,
+    decoder_width=32,
+    decoder_heads=4,
+    decoder_layers=2,
+    decoder_hidden=32,
+    queries=12,
+    points=5,
+    cameras=2,
+    history_capacity=6,
+    # An untrained network scores everything about 0.5.
+    keep_threshold=0.4,
+    birth_threshold=0.52,
+)
+SIZE = (64, 96)
+NO_QUIRKS = MapTrackerQuirks(**dict.fromkeys(MapTrackerQuirks.model_fields, False))
+
+
+def two_cameras() -> Tensor:
+    """One camera looks forward, one back, 1.5 m above the ground."""
+    intrinsics = np.array([[60.0, 0, 48, 0], [0, 60.0, 32, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    forward = np.array([[0.0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]])
+    backward = np.array([[0.0, 1, 0, 0], [0, 0, -1, 1.5], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    return torch.from_numpy(np.stack([intrinsics @ forward, intrinsics @ backward]))
+
+
+def small_network(seed: int = 0, **changes: object) -> MapTracker:
+    torch.manual_seed(seed)
+    network = MapTracker(SMALL.model_copy(update=changes)).eval()
+    with torch.no_grad():
+        # Sampling offsets and biases away from zero, so that nothing is trivial.
+        for name, parameter in network.named_parameters():
+            if parameter.ndim == 1:
+                parameter.add_(0.1 * torch.randn_like(parameter))
+            elif name.endswith("offsets.weight"):
+                parameter.add_(0.05 * torch.randn_like(parameter))
+    return network
+
+
+def frames(count: int, seed: int, step: float = 1.7) -> list[FrameInputs]:
+    generator = torch.Generator().manual_seed(seed)
+    inputs = []
+    for number in range(count):
+        pose = torch.eye(4, dtype=torch.float64)[None]
+        pose[0, :2, 3] = torch.tensor([1000.0 + step * number, -500.0 + seed], dtype=torch.float64)
+        images = 30 * torch.randn(1, 2, 3, *SIZE, generator=generator)
+        inputs.append(FrameInputs(images, torch.ones(1, 2, dtype=torch.bool), pose))
+    return inputs
+
+
+def together(streams: list[FrameInputs]) -> FrameInputs:
+    return FrameInputs(*(torch.cat([getattr(one, name) for one in streams]) for name in vars(streams[0])))
+
+
+@torch.no_grad()
+def step(network: MapTracker, inputs: FrameInputs, state: MapTrackerState | None):
+    pillars = make_camera_pillars(two_cameras(), SIZE, network.config)
+    outputs = network(inputs, pillars, state)
+    selection = select_tracks(outputs, state, network.config)
+    return outputs, network.advance(state, outputs, selection.instances, inputs)
+
+
+def plain_deformable_convolution(convolution: DeformableConvolution, features: Tensor) -> Tensor:
+    """Tap by tap with grid_sample."""
+    _, _, height, width = features.shape
+    moves = convolution.offsets(features)
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    total = 0.0
+    for tap in range(9):
+        y = rows + tap // 3 - 1 + moves[:, 2 * tap]
+        x = columns + tap % 3 - 1 + moves[:, 2 * tap + 1]
+        grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
+        sampled = F.grid_sample(features, grid, align_corners=False) * moves[:, 18 + tap, None].sigmoid()
+        total = total + torch.einsum("oc,nchw->nohw", convolution.weight[:, :, tap // 3, tap % 3], sampled)
+    return total
+
+
+def test_deformable_convolution_equals_its_plain_twin_and_its_gradients():
+    torch.manual_seed(1)
+    convolution = DeformableConvolution(6, 8).double()
+    torch.nn.init.normal_(convolution.offsets.weight, std=0.3)
+    features = torch.randn(2, 6, 7, 9, dtype=torch.float64, requires_grad=True)
+    outputs = [convolution(features), plain_deformable_convolution(convolution, features)]
+    torch.testing.assert_close(*outputs)
+    weights = torch.randn_like(outputs[0])
+    inputs = [features, *convolution.parameters()]
+    fast, plain = (torch.autograd.grad((output * weights).sum(), inputs) for output in outputs)
+    for one, other in zip(fast, plain, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_deformable_attention_equals_grid_sample():
+    torch.manual_seed(2)
+    sizes, heads, width, queries, samples = [(6, 8), (3, 4)], 2, 5, 7, 3
+    values = torch.randn(6 * 8 + 3 * 4, heads, width, dtype=torch.float64)
+    x, y = (torch.rand(queries, heads, 2, samples, dtype=torch.float64) * 10 - 1 for _ in range(2))
+    weights = torch.rand(queries, heads, 2, samples, dtype=torch.float64)
+    found = deformable_attention(values, torch.zeros(queries, dtype=torch.int32), x, y, weights, sizes)
+    expected, first = torch.zeros(heads, width, queries, dtype=torch.float64), 0
+    for level, (rows, columns) in enumerate(sizes):
+        level_map = values[first : first + rows * columns].permute(1, 2, 0).unflatten(-1, (rows, columns))
+        grid = torch.stack([(2 * x[:, :, level] + 1) / columns - 1, (2 * y[:, :, level] + 1) / rows - 1], dim=-1)
+        sampled = F.grid_sample(level_map, grid.transpose(0, 1), align_corners=False)
+        expected += (sampled * weights[:, :, level].transpose(0, 1)[:, None]).sum(dim=-1)
+        first += rows * columns
+    torch.testing.assert_close(found, expected.permute(2, 0, 1).flatten(1))
+
+
+@pytest.mark.parametrize(("kernel", "stride"), [(1, 1), (1, 2), (3, 1), (7, 2)])
+def test_folded_norm_equals_convolution_then_norm(kernel, stride):
+    torch.manual_seed(3)
+    unit = NormalisedConvolution(4, 6, kernel, stride).double().eval()
+    unit.norm.running_mean.normal_()
+    unit.norm.running_var.uniform_(0.5, 2.0)
+    features = torch.randn(2, 4, 9, 11, dtype=torch.float64)
+    torch.testing.assert_close(unit(features), unit.norm(unit.convolution(features)))
+
+
+@given(st.tuples(*[st.floats(-4, 4)] * 3))
+@settings(max_examples=50, deadline=None)
+def test_quaternions_are_those_of_scipy(vector):
+    rotation = Rotation.from_rotvec(vector)
+    found = quaternion(torch.from_numpy(rotation.as_matrix())).numpy()
+    expected = rotation.as_quat()
+    assert np.abs(found - expected * np.sign(expected @ found)).max() < 1e-7
+    assert found[np.abs(found).argmax()] > 0
+
+
+def test_inverse_pose_undoes_the_pose():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.1, -0.2, 2.0]).as_matrix())
+    pose[:3, 3] = torch.tensor([5.0, -3.0, 1.0])
+    torch.testing.assert_close(invert_pose(pose) @ pose, torch.eye(4, dtype=torch.float64))
+
+
+def plain_choice(travelled: list[float], fallback: str) -> list[int]:
+    """The rule of the strided selection, entry by entry."""
+    if len(travelled) <= 4:
+        return list(range(len(travelled)))
+    order = sorted(range(len(travelled)), key=lambda index: travelled[index])
+    left, picks = list(order), []
+    for distance in (15.0, 10.0, 5.0, 1.0):
+        far = [index for index in left if travelled[index] >= distance]
+        if far:
+            picks.append(far[0])
+            left = left[: left.index(far[0])]
+        elif left:
+            picks.append(left.pop())
+        else:
+            latest = list(range(len(travelled)))[-4:]
+            return latest if fallback == "latest" else order[:4][::-1]
+    return picks
+
+
+@given(
+    st.lists(st.floats(0, 30), min_size=1, max_size=9),
+    st.integers(0, 3),
+    st.sampled_from(["latest", "nearest"]),
+)
+@settings(max_examples=300, deadline=None)
+def test_history_is_chosen_as_the_plain_rule_says(travelled, unused, fallback):
+    distances = torch.tensor([[0.0] * unused + travelled])
+    valid = torch.tensor([[False] * unused + [True] * len(travelled)])
+    slots, chosen = choose_history(distances, valid, (1.0, 5.0, 10.0, 15.0), fallback)
+    assert (slots[0][chosen[0]] - unused).tolist() == plain_choice(distances[0, unused:].tolist(), fallback)
+    assert slots.shape[1] == min(4, len(travelled) + unused)
+
+
+def test_without_the_quirk_the_warp_by_no_motion_changes_nothing():
+    still = torch.eye(4, dtype=torch.float64)[None]
+    maps = torch.rand(1, 3, SMALL.rows, SMALL.columns)
+    plain = F.grid_sample(maps, warp_grid(still, SMALL.model_copy(update={"quirks": NO_QUIRKS})), align_corners=False)
+    torch.testing.assert_close(plain, maps, atol=1e-5, rtol=0)
+    zoomed = F.grid_sample(maps, warp_grid(still, SMALL), align_corners=False)
+    assert (zoomed - maps).abs().max() > 0.1
+
+
+def test_points_move_against_the_car():
+    """The car drives 6 m forward: a point 6 m ahead is now here; what leaves the region stays on its border."""
+    past_to_current = torch.eye(4, dtype=torch.float64)[None]
+    past_to_current[0, 0, 3] = -6.0
+    points = torch.tensor([[[[0.6, 0.5], [0.05, 0.25]]]])
+    torch.testing.assert_close(
+        move_on_ground(points, past_to_current, SMALL), torch.tensor([[[[0.5, 0.5], [0.0, 0.25]]]])
+    )
+
+
+@pytest.mark.parametrize("quirks", [MapTrackerQuirks(), NO_QUIRKS], ids=["quirks", "no quirks"])
+def test_streams_side_by_side_give_what_each_gives_alone(quirks):
+    network = small_network(quirks=quirks)
+    streams = [frames(7, seed) for seed in (0, 1)]
+    alone = []
+    for stream in streams:
+        state, results = None, []
+        for inputs in stream:
+            outputs, state = step(network, inputs, state)
+            results.append((outputs.layers[-1].points[0, -SMALL.queries :], state.instances.track_ids[0].tolist()))
+        alone.append(results)
+    assert any(len(ids) for results in alone for _, ids in results[1:])
+    state = None
+    for number in range(7):
+        outputs, state = step(network, together([stream[number] for stream in streams]), state)
+        for stream in range(2):
+            points, ids = alone[stream][number]
+            torch.testing.assert_close(outputs.layers[-1].points[stream, -SMALL.queries :], points, atol=2e-4, rtol=0)
+            assert state.instances.track_ids[stream][state.instances.valid[stream]].tolist() == ids
+
+
+def test_a_step_leaves_the_state_that_went_in_as_it_was():
+    network, inputs = small_network(), frames(3, 0)
+    _, state = step(network, inputs[0], None)
+    _, state = step(network, inputs[1], state)
+    first, _ = step(network, inputs[2], state)
+    again, _ = step(network, inputs[2], state)
+    torch.testing.assert_close(first.queries, again.queries, atol=0, rtol=0)
+
+
+def test_a_masked_camera_reaches_nothing():
+    network = small_network()
+    inputs = frames(1, 0)[0]
+    inputs.camera_valid[0, 1] = False
+    outputs, _ = step(network, inputs, None)
+    inputs.images[0, 1] = torch.nan
+    again, _ = step(network, inputs, None)
+    torch.testing.assert_close(outputs.bev, again.bev, atol=0, rtol=0)
+
+
+def test_memory_keeps_no_more_than_its_capacity():
+    network, state = small_network(), None
+    for inputs in frames(9, 0):
+        _, state = step(network, inputs, state)
+    assert state.bev_memory.shape[1] == SMALL.history_capacity
+    assert state.vector_memory.valid.shape[2] == SMALL.history_capacity
+    ages = (state.frame[:, None, None] - state.vector_memory.frames)[state.vector_memory.valid]
+    assert ages.max() <= SMALL.history_capacity
+    assert (state.vector_memory.valid.sum(dim=-1) >= 1).all()
+
+
+def test_gradient_reaches_every_parameter():
+    """The motion perceptron learns from a loss of its own; without it, it is the only part without gradient."""
+    network = small_network().train()
+    pillars = make_camera_pillars(two_cameras(), SIZE, network.config)
+    state, loss = None, torch.zeros(())
+    for inputs in frames(2, 0):
+        outputs = network(inputs, pillars, state)
+        selection = select_tracks(outputs, state, network.config.model_copy(update={"first_birth_threshold": 0.0}))
+        state = network.advance(state, outputs, selection.instances, inputs)
+        loss = loss + outputs.segmentation.square().mean()
+        loss = loss + sum(layer.logits.square().mean() + layer.points.square().mean() for layer in outputs.layers)
+    loss.backward()
+    untouched = [name for name, value in network.named_parameters() if value.grad is None or not value.grad.any()]
+    assert all(name.startswith("motion.") for name in untouched), untouched
+    assert network.bev_encoder.level_code.grad[3].abs().max() == 0
