@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, RegionOfInterest
+from predmapnet.datasets.ground_truth.raster import mask_iou
 from predmapnet.evaluation.frames import EvaluationFrame
 
 Float = NDArray[np.float64]
@@ -162,17 +163,9 @@ def _draw(polylines: Sequence[Float], kind: ElementKind, roi: RegionOfInterest, 
 
 def _overlaps(predicted: Mask, truths: Mask) -> tuple[Float, float]:
     """Overlap of every pair ``(n, m)``, and of the two unions."""
-    flat = predicted.reshape(len(predicted), -1)
-    areas = np.array([cv2.countNonZero(mask) for mask in predicted])
-    iou = np.zeros((len(predicted), len(truths)))
-    for column, truth in enumerate(truths):
-        pixels = np.flatnonzero(truth)
-        shared = flat[:, pixels].sum(axis=1, dtype=np.int64)
-        union = areas + len(pixels) - shared
-        iou[:, column] = np.divide(shared, union, out=np.zeros(len(shared)), where=union > 0)
-    all_predicted, all_truths = predicted.any(axis=0), truths.any(axis=0)
-    union_area = int((all_predicted | all_truths).sum())
-    return iou, float((all_predicted & all_truths).sum() / union_area) if union_area else 0.0
+    first, second = predicted.reshape(len(predicted), -1), truths.reshape(len(truths), -1)
+    both = mask_iou(first.max(axis=0, keepdims=True), second.max(axis=0, keepdims=True))
+    return mask_iou(first, second), float(both[0, 0])
 
 
 def _match(iou: Float, thresholds: Float) -> Integer:

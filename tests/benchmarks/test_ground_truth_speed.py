@@ -1,4 +1,7 @@
-"""Milliseconds per frame of ground truth, as ratios to what the official code took on the same maps and poses."""
+"""Milliseconds per frame of ground truth, as ratios to what the official code took on the same maps and poses.
+
+    pytest -m benchmark_only -s tests/benchmarks/test_ground_truth_speed.py
+"""
 
 import json
 import os
