@@ -18,10 +18,12 @@ from cli.console import say_error
 from cli.diff import diff
 from cli.evaluate import evaluate
 from cli.infer import infer
+from cli.integrate import integrate
 from cli.merge import merge
 from cli.scenes import scenes
 from cli.train import train
 from cli.view import view
+from cli.weights import weights
 from predmapnet.errors import UserError
 
 DISK_IS_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -39,6 +41,8 @@ app.command()(batch)
 app.command()(scenes)
 app.command()(evaluate)
 app.command()(train)
+app.add_typer(weights)
+app.command()(integrate)
 app.command()(merge)
 app.command()(diff)
 

@@ -1,0 +1,111 @@
+"""``predmapnet integrate``: anybody's per-frame results into one map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mapfusion.elements import RegionOfInterest
+    from mapfusion.export.geojson import Georeference
+
+
+def integrate(
+    frames: Annotated[
+        Path,
+        typer.Argument(help="Per-frame results: .parquet of --save-frames, or .json of MapTracker, MapTR and kin."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
+    poses: Annotated[
+        Path | None, typer.Option(help="Poses by token (.json or .csv), for .json results.", show_default=False)
+    ] = None,
+    location: Annotated[
+        str | None, typer.Option(help="Where the poses' frame lies: a nuScenes map or Argoverse 2 city (PIT).")
+    ] = None,
+    origin: Annotated[
+        str | None, typer.Option(help="Or latitude,longitude of its origin, x pointing east: 49.01,8.41.")
+    ] = None,
+    roi: Annotated[str, typer.Option(help="What the detector looked at, metres along x and y.")] = "60x30",
+    min_score: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="For results without track ids: use elements from this score on.")
+    ] = 0.4,
+    y_forward: Annotated[
+        bool, typer.Option("--y-forward", help="The results' x points right and y forward (MapTR on nuScenes).")
+    ] = False,
+) -> None:
+    """Fuse what any detector saw, frame by frame, into one map."""
+    from cli.console import out as screen
+    from cli.console import say_warning
+    from mapfusion.elements import ElementKind
+    from mapfusion.io import write_map
+    from predmapnet import __version__
+    from predmapnet.errors import UserError
+    from predmapnet.integration import integrate_file
+    from predmapnet.outputs import Outputs
+
+    Outputs(map=out).check()
+    region = _region(roi)
+    if location is not None or origin is not None:
+        _georeference(location, origin)  # a mistake there is told before the work begins
+    done = integrate_file(frames, poses, region, min_score, y_forward)
+    georeference = _georeference(location or (None if origin else done.location), origin)
+    provenance = {
+        "generator": "predmapnet integrate",
+        "version": __version__,
+        "frames_file": frames.name,
+        "logs": list(done.logs),
+    }
+    try:
+        write_map(done.map, out, georeference, provenance)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    for note in done.notes:
+        say_warning(note)
+    for reason, count in done.rejections.items():
+        say_warning(f"the integrator left out {count} x {reason}")
+    counts = ", ".join(f"{len(done.map.of_kind(kind))} {kind.label}" for kind in ElementKind)
+    screen.print(f"{done.frames} frames of {len(done.logs)} drives: {counts}", markup=False)
+    screen.print(f"written: {out}", markup=False)
+
+
+def _region(text: str) -> RegionOfInterest:
+    from mapfusion.elements import RegionOfInterest
+    from predmapnet.errors import UserError
+
+    try:
+        length, width = (float(side) for side in text.lower().split("x"))
+    except ValueError as error:
+        raise UserError(f"--roi {text}: two lengths in metres are expected, as in 60x30") from error
+    if not (0 < length <= 500 and 0 < width <= 500):
+        raise UserError(f"--roi {text}: lengths between 0 and 500 m are expected")
+    return RegionOfInterest(length, width)
+
+
+def _georeference(location: str | None, origin: str | None) -> Georeference:
+    from mapfusion.export.plane import LocalPlane
+    from predmapnet.datasets.georeference import (
+        ARGOVERSE2_CITIES,
+        NUSCENES_ORIGINS,
+        argoverse2_georeference,
+        nuscenes_georeference,
+    )
+    from predmapnet.errors import UserError
+
+    if origin is not None:
+        try:
+            latitude, longitude = (float(number) for number in origin.split(","))
+        except ValueError as error:
+            raise UserError(
+                f"--origin {origin}: latitude,longitude in degrees are expected, as in 49.01,8.41"
+            ) from error
+        if not (abs(latitude) < 85 and abs(longitude) <= 180):
+            raise UserError(f"--origin {origin} does not lie on Earth; latitude comes first")
+        return LocalPlane(longitude, latitude, "given origin")
+    found = nuscenes_georeference(location or "") or argoverse2_georeference(location or "")
+    if found is None:
+        known = ", ".join([*NUSCENES_ORIGINS, *ARGOVERSE2_CITIES])
+        where = f"the location '{location}' is not known" if location else "nobody knows where on Earth the poses lie"
+        raise UserError(f"{where}: give --location (one of {known}) or --origin latitude,longitude")
+    return found

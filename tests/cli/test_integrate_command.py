@@ -1,0 +1,167 @@
+"""Other detectors' results become a map, and what does not fit is named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mapfusion import ElementKind
+from mapfusion.export.plane import LocalPlane
+from mapfusion.io import read_map
+from predmapnet.evaluation.frames_io import FrameWriter
+from tests.mapfusion.simulation import town_drive
+
+ORIGIN = "49.0,8.4"
+PLANE = LocalPlane(8.4, 49.0)
+NAMES = ("ped_crossing", "divider", "boundary")
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return town_drive(3, frames=12)
+
+
+def submission(drive, ids=True) -> dict:
+    results = {}
+    for number, frame in enumerate(drive.frames):
+        entry = {
+            "vectors": [line.tolist() for line in frame.polylines],
+            "scores": frame.scores.tolist(),
+            "labels": frame.kinds.tolist(),
+        }
+        results[f"token-{number}"] = entry | ({"global_ids": frame.track_ids.tolist()} if ids else {})
+    return {"meta": {}, "results": results}
+
+
+def maptr(drive) -> dict:
+    """As MapTR writes on nuScenes: x right, y forward, classes by name, crossings not closed."""
+    results = []
+    for number, frame in enumerate(drive.frames):
+        vectors = [
+            {
+                "pts": np.column_stack([-line[:, 1], line[:, 0]]).tolist(),
+                "cls_name": NAMES[kind],
+                "type": 0,
+                "confidence_level": score,
+            }
+            for line, kind, score in zip(frame.polylines, frame.kinds, frame.scores, strict=True)
+        ]
+        results.append({"sample_token": f"token-{number}", "vectors": vectors})
+    return {"meta": {}, "results": results}
+
+
+def poses(drive) -> dict:
+    return {
+        f"token-{i}": {"timestamp": f.timestamp, "ego_to_global": f.ego_to_global.tolist(), "scene": "log-1"}
+        for i, f in enumerate(drive.frames)
+    }
+
+
+def write(path, content):
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.fixture
+def reference(predmapnet, tmp_path, drive):
+    """The map of the same frames from our own Parquet, which the others must equal."""
+    with FrameWriter(tmp_path / "frames.parquet", {"location": "somewhere"}) as writer:
+        for i, frame in enumerate(drive.frames):
+            writer.write("log-1", i, frame)
+    result = predmapnet("integrate", "frames.parquet", "--origin", ORIGIN, "--out", "reference.geojson")
+    assert result.code == 0, result.err
+    found = read_map(tmp_path / "reference.geojson", PLANE)
+    assert len(found) > 5
+    return found
+
+
+def assert_like(one, two, share):
+    for kind in (ElementKind.DIVIDER, ElementKind.BOUNDARY):
+        assert one.length(kind) == pytest.approx(two.length(kind), rel=share)
+
+
+def test_a_submission_with_ids_gives_the_same_map(predmapnet, tmp_path, drive, reference):
+    write(tmp_path / "results.json", submission(drive))
+    write(tmp_path / "poses.json", poses(drive))
+    result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "--out", "map.gpkg")
+    assert result.code == 0, result.err
+    assert "12 frames of 1 drives" in result.out
+    assert_like(read_map(tmp_path / "map.gpkg", PLANE), reference, 1e-4)
+
+
+def test_results_of_maptr_and_poses_in_csv(predmapnet, tmp_path, drive, reference):
+    write(tmp_path / "results.json", maptr(drive))
+    lines = ["token,timestamp,x,y,yaw,scene"]
+    for i, frame in enumerate(drive.frames):
+        pose = frame.ego_to_global
+        x, y, yaw = pose[0, 3], pose[1, 3], np.arctan2(pose[1, 0], pose[0, 0])
+        lines.append(
+            f"token-{i},{frame.timestamp},{x!r},{y!r},{yaw!r},log-1".replace("np.float64(", "").replace(")", "")
+        )
+    (tmp_path / "poses.csv").write_text("\n".join(lines))
+    arguments = ("integrate", "results.json", "--poses", "poses.csv", "--origin", ORIGIN, "--out", "map.geojson")
+    turned = predmapnet(*arguments)
+    assert turned.code == 2
+    assert "--y-forward" in turned.err
+    result = predmapnet(*arguments, "--y-forward")
+    assert result.code == 0, result.err
+    assert "no track ids" in result.err
+    assert_like(read_map(tmp_path / "map.geojson", PLANE), reference, 0.25)
+
+
+def change(found, path, value):
+    for key in path[:-1]:
+        found = found[key]
+    found[path[-1]] = value
+
+
+@pytest.mark.parametrize(
+    ("in_poses", "path", "value", "words"),
+    [
+        (True, ("token-3", "ego_to_global", 0, 3), float("inf"), "pose"),
+        (True, ("token-3", "ego_to_global", 0, 0), 7.0, "not rigid"),
+        (True, ("token-3", "ego_to_global"), [1, 2], "2 numbers instead of 16"),
+        (True, ("token-3", "timestamp"), "noon", "token-3"),
+        (False, ("results", "token-3", "scores"), [0.5], "token-3"),
+        (False, ("results", "token-3"), 5, "token-3"),
+    ],
+)
+def test_mistakes_are_named(predmapnet, tmp_path, drive, in_poses, path, value, words):
+    results, where = submission(drive), poses(drive)
+    change(where if in_poses else results, path, value)
+    write(tmp_path / "results.json", results)
+    write(tmp_path / "poses.json", where)
+    result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "-o", "map.geojson")
+    assert result.code == 2
+    assert words in result.err
+    assert "Traceback" not in result.err
+    assert not (tmp_path / "map.geojson").exists()
+
+
+def test_tokens_that_do_not_match_are_named(predmapnet, tmp_path, drive):
+    write(tmp_path / "results.json", submission(drive))
+    write(tmp_path / "poses.json", {f"sample-{key}": pose for key, pose in poses(drive).items()})
+    result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "-o", "map.geojson")
+    assert result.code == 2
+    assert "12 of 12 frames" in result.err
+    assert "sample-token-0" in result.err
+    for arguments, words in (
+        (("results.json", "-o", "map.geojson", "--origin", ORIGIN), "--poses"),
+        (("results.json", "--poses", "poses.json", "-o", "map.geojson", "--location", "Atlantis"), "boston-seaport"),
+        (("results.json", "--poses", "poses.json", "-o", "map.geojson", "--origin", "here"), "latitude,longitude"),
+        (("results.json", "--poses", "poses.json", "-o", "map.geojson", "--roi", "big"), "60x30"),
+        (("nothing.json", "--poses", "poses.json", "-o", "map.geojson"), "no file"),
+    ):
+        result = predmapnet("integrate", *arguments)
+        assert result.code == 2, arguments
+        assert words in result.err
+
+
+def test_points_that_are_not_finite_are_counted(predmapnet, tmp_path, drive):
+    results = submission(drive)
+    results["results"]["token-2"]["vectors"][0][1][0] = float("nan")
+    write(tmp_path / "results.json", results)
+    write(tmp_path / "poses.json", poses(drive))
+    result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "-o", "map.geojson")
+    assert result.code == 0, result.err
+    assert "1 x points not finite" in result.err
