@@ -24,6 +24,9 @@ from predmapnet.weights.checkpoint import KEY
 from predmapnet.weights.maptracker_names import name_here, original_of_alias
 
 FORMAT = "maptracker-1"
+BEGINNINGS = (b"PK", b"\x80\x02", b"\x80\x04", b"\x80\x05")
+"""Of files that torch or pickle have written."""
+
 CAMERA_CODE = "bev_encoder.camera_code"
 _SHOWN_NAMES = 4
 
@@ -58,7 +61,7 @@ def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
-        if "weights_only" in str(error) or "Unsupported" in str(error):
+        if _beginning(path) in BEGINNINGS:
             raise UserError(_not_only_tensors(path, error)) from None
         raise UserError(f"{path} is not a whole PyTorch checkpoint. Fetch it again.") from None
     except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
@@ -205,6 +208,11 @@ def _not_only_tensors(path: Path, error: Exception) -> str:
         f"not done ({_first_line(error)}). If you trust its source, write its 'state_dict' alone to a new file with "
         "the program that made it."
     )
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(2)
 
 
 def _first_line(error: Exception) -> str:

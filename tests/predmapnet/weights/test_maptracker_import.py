@@ -1,0 +1,142 @@
+"""MapTracker's checkpoints: every entry is explained, what does not fit is refused, nothing is executed."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+
+from predmapnet.errors import UserError
+from predmapnet.weights.inspection import inspect_file
+from predmapnet.weights.maptracker_import import (
+    import_maptracker,
+    load_maptracker,
+    read_official_checkpoint,
+    save_maptracker,
+)
+from predmapnet.weights.maptracker_names import RULES, name_here
+from tests.predmapnet.network.maptracker_reference import FOLDER, load_reference
+
+
+@pytest.fixture(scope="module")
+def official():
+    if not (FOLDER / "state_dict_keys.json").is_file():
+        pytest.skip(f"no reference fixtures in {FOLDER}: set PREDMAPNET_REFERENCE")
+    return load_reference().official_state
+
+
+@pytest.fixture
+def changed(official):
+    return dict(official)
+
+
+@pytest.mark.reference
+def test_every_entry_is_mapped_or_ignored_with_a_reason(official):
+    network, report = import_maptracker(official)
+    assert report.mapped.keys() | report.ignored.keys() == official.keys()
+    assert sorted(report.mapped.values()) == sorted(network.state_dict())
+    assert not report.missing
+    shared = [entry["name"] for entry in load_reference().entries if entry["alias_of"]]
+    assert set(report.ignored) == {*shared, "plane", "head.roi_size", "head.origin"}
+    for name, here in report.mapped.items():
+        assert torch.equal(official[name], network.state_dict()[here])
+    assert not network.training
+
+
+@pytest.mark.reference
+def test_a_checkpoint_of_mmcv_comes_back_from_safetensors(official, tmp_path):
+    path, out = tmp_path / "maptracker.pth", tmp_path / "weights.safetensors"
+    torch.save({"meta": {"epoch": 48, "iter": 1}, "state_dict": official, "optimizer": {"state": {}}}, path)
+    network, _ = import_maptracker(read_official_checkpoint(path))
+    save_maptracker(out, network, {"imported_from": path.name})
+    again = load_maptracker(out)
+    assert again.config == network.config
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], tensor)
+    info = inspect_file(out)
+    assert info.about["facts"] == {"imported_from": "maptracker.pth"}
+    assert sum(info.parts().values()) == sum(tensor.numel() for tensor in network.state_dict().values())
+
+
+@pytest.mark.reference
+def test_old_names_and_parallel_training_and_absent_counters(changed):
+    old = {
+        f"module.{name.replace('conv2.conv_offset', 'conv2_offset')}": tensor
+        for name, tensor in changed.items()
+        if not name.endswith("num_batches_tracked")
+    }
+    _, report = import_maptracker({name.removeprefix("module."): tensor for name, tensor in old.items()})
+    assert report.missing
+    assert all(name.endswith("num_batches_tracked") for name in report.missing)
+
+
+@pytest.mark.reference
+def test_seven_cameras_are_argoverse(changed):
+    changed["backbone.transformer.cams_embeds"] = torch.zeros(7, 256)
+    network, _ = import_maptracker(changed)
+    assert (network.config.cameras, network.config.image_height, network.config.image_width) == (7, 608, 608)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("head.query_embedding.weight", None, "1 missing: detection_queries"),
+        ("head.query_embedding.weight", torch.zeros(50, 512), r"detection_queries \(50, 512\) instead of \(100, 512\)"),
+        ("head.something_new", torch.zeros(3), "1 unknown: head.something_new"),
+        ("head.cls_branches.3.bias", torch.zeros(3), "head.cls_branches.3.bias differs from head.cls_branches.0.bias"),
+        ("head.roi_size", torch.tensor([100.0, 50.0]), "head.roi_size is not what a region of 60 m x 30 m needs"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changed, name, value, says):
+    if value is None:
+        del changed[name]
+    else:
+        changed[name] = value
+    with pytest.raises(UserError, match=says):
+        import_maptracker(changed)
+
+
+class Malicious:
+    """Touches a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_nothing_in_a_checkpoint_is_executed(tmp_path):
+    touched, zipped, bare = tmp_path / "touched", tmp_path / "zipped.pth", tmp_path / "bare.pth"
+    torch.save({"state_dict": {"plane": torch.zeros(1)}, "meta": Malicious(touched)}, zipped)
+    bare.write_bytes(pickle.dumps(Malicious(touched), protocol=2))
+    for path in (zipped, bare):
+        with pytest.raises(UserError, match=path.name):
+            read_official_checkpoint(path)
+    assert not touched.exists()
+    pickle.loads(bare.read_bytes())
+    assert touched.exists(), "the trap itself works"
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 cut short"])
+def test_damaged_files_are_named(tmp_path, content):
+    path = tmp_path / "broken.pth"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"broken\.pth is not a whole PyTorch checkpoint"):
+        read_official_checkpoint(path)
+
+
+def test_a_file_without_a_state_dict_says_so(tmp_path):
+    path = tmp_path / "list.pth"
+    torch.save([torch.zeros(2)], path)
+    with pytest.raises(UserError, match="holds no state dict"):
+        read_official_checkpoint(path)
+    with pytest.raises(UserError, match="There is no file"):
+        read_official_checkpoint(tmp_path / "absent.pth")
+
+
+def test_names_are_translated_by_one_rule_only():
+    assert len(set(RULES.values())) == len(RULES) - 1, "only the old name of the offsets shares a target"
+    assert name_here("head.transformer.decoder.layers.5.norms.2.bias") == "decoder.layers.5.norms.2.bias"
+    assert name_here("head.transformer.decoder.other") is None
