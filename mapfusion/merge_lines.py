@@ -35,6 +35,9 @@ SPACING = 1.0
 BLEND_LENGTH = 10.0
 """A step between two stretches that are linked is spread over this distance, metres."""
 
+SHORTEST_LOOP = 20
+"""A line of fewer stations is not closed when its ends meet."""
+
 LINK_REACH = 2.5
 """A line goes on from a reference if it leaves it this close to the reference's end, metres."""
 
@@ -300,6 +303,9 @@ def _chain(lines: list[Piece], links: list[tuple[float, tuple[int, int], tuple[i
             continue
         (one, end), (two, start) = ends[first], ends[second]
         if one == two:
+            if len(parts[one].points) >= SHORTEST_LOOP:
+                parts[one] = parts[one].closed()
+                del ends[first], ends[second]
             continue
         before = parts[one] if end == -1 else parts[one].reversed()
         after = parts[two] if start == 0 else parts[two].reversed()

@@ -130,6 +130,11 @@ class Piece:
             self.kind, self.points[::-1], self.values[::-1], self.observations, self.first_seen, self.last_seen
         )
 
+    def closed(self) -> Piece:
+        """Return it led back to its start."""
+        points, values = np.vstack([self.points, self.points[:1]]), np.vstack([self.values, self.values[:1]])
+        return Piece(self.kind, points, values, self.observations, self.first_seen, self.last_seen)
+
     def joined(self, other: Piece) -> Piece:
         """Return this piece with another put to its end, their common point in the middle."""
         points = np.concatenate([self.points, other.points[1:]])

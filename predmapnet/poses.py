@@ -82,7 +82,7 @@ def _json_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
 def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     with path.open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file))
-    result = []
+    result: list[tuple[str, Mapping[str, Any]]] = []
     for line, row in enumerate(rows, start=2):
         values: dict[str, Any] = {key.strip(): value for key, value in row.items() if key and value not in (None, "")}
         try:

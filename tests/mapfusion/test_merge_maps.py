@@ -215,3 +215,13 @@ def test_names_tell_files_apart(tmp_path):
     assert short_names([a]) == ["map"]
     with pytest.raises(ValueError, match="twice"):
         short_names([a, a])
+
+
+def test_a_kerb_around_a_block_is_closed_however_the_drives_cut_it():
+    corner = np.array([[0, 0], [130, 0], [130, 110], [0, 110], [0, 0]], dtype=float)
+    ring = shapely.get_coordinates(shapely.segmentize(shapely.LineString(corner), 1.0))
+    turns = [GlobalMap((line(np.roll(ring[:-1], k, axis=0)[:320], BOUNDARY),)) for k in (0, 130, 300)]
+    merged, _ = merge_maps(turns)
+    (kerb,) = merged.of_kind(BOUNDARY)
+    np.testing.assert_allclose(kerb.points[0], kerb.points[-1], atol=1e-6)
+    assert kerb.length == pytest.approx(480.0, abs=3.0)
