@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
+from mapfusion.coverage import observed_rings
 from mapfusion.diff import Change, DiffConfig, diff_maps, settle, write_diff
 from mapfusion.export.plane import LocalPlane
 from mapfusion.geometry import resample
@@ -141,3 +142,16 @@ def test_empty_maps_compare():
     found = diff_maps(empty, town())
     assert total(found, Change.ADDED) == pytest.approx(sum(e.length for e in town()), rel=1e-3)
     assert total(diff_maps(town(), empty), Change.UNOBSERVED) > 0
+
+
+def test_the_ground_that_a_drive_says_it_saw_decides_between_removed_and_unobserved():
+    plane = LocalPlane(8.0, 49.0)
+    kerb = line([[0, 0], [200, 0]], BOUNDARY)
+    far = line([[0, 25], [200, 25]], BOUNDARY)
+    seen = shapely.box(-30.0, -15.0, 120.0, 40.0)
+    rings = observed_rings(seen, plane)
+    found = diff_maps(GlobalMap((kerb, far)), GlobalMap((kerb,), {"observed": rings}), plane, DiffConfig(align=False))
+    assert found.metres(Change.REMOVED, BOUNDARY) == pytest.approx(120.0, abs=1.0)
+    assert found.metres(Change.UNOBSERVED, BOUNDARY) == pytest.approx(80.0, abs=1.0)
+    guessed = diff_maps(GlobalMap((kerb, far)), GlobalMap((kerb,)), plane, DiffConfig(align=False))
+    assert guessed.metres(Change.REMOVED, BOUNDARY) == 0.0
