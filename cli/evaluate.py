@@ -72,6 +72,8 @@ def evaluate(
 
     if results is not None and not results.exists():
         raise UserError(f"There is no file or folder {results}.")
+    if roi is not Region.STANDARD and (results is None or results.suffix != ".json"):
+        raise UserError("--roi is for submissions (.json); what is mapped here and our own files know their region.")
     length, width = (float(side) for side in roi.value.split("x"))
     settings = EvaluationSettings(
         dataset,

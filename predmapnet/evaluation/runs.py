@@ -157,8 +157,13 @@ def _mapper(settings: EvaluationSettings) -> Mapper:
     return Mapper.from_checkpoint(settings.weights, device=settings.device)
 
 
-@lru_cache(maxsize=1)
 def _submission(path: Path) -> Submitted:
+    return _read_submission(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _read_submission(path: Path, changed: int) -> Submitted:
+    """Read a submission once for as long as it does not change (``changed``: when it was written)."""
     return read_submission(path)
 
 

@@ -159,3 +159,5 @@ def test_what_cannot_be_measured_is_said_in_one_message(predmapnet, tiny_root, t
         assert result.code == 2 and message in result.err, result.err
         assert result.err.count("Error:") == 1
     assert not (tmp_path / "f.json").exists()
+    result = predmapnet("evaluate", tmp_path / "other.parquet", "--data-root", tiny_root, "--roi", "100x50")
+    assert result.code == 2 and "--roi is for submissions" in result.err
