@@ -86,7 +86,10 @@ def test_every_overlap_and_match_is_the_official_one(case, variant):
 
 
 def test_segmentation_iou_is_the_official_one(case):
-    given = np.load(case.folder / "seg.npz", allow_pickle=False)
+    path = case.folder / "seg.npz"
+    if not path.exists():
+        pytest.skip(f"no segmentation masks: {path}")
+    given = np.load(path, allow_pickle=False)
     truths = np.unpackbits(given["gt_mask_packed"], axis=-1).astype(bool)[:, :, ::-1]
     predicted = given["pred_class_map"][:, None] == np.arange(1, 4)[:, None, None]
     ours = segmentation_iou(zip(predicted, truths, strict=True))
