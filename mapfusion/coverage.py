@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import reduce
 
 import numpy as np
 import shapely
@@ -15,6 +16,9 @@ Float = NDArray[np.float64]
 
 NEAR = 8.0
 """Ground within this distance of an element that was found counts as looked at, metres."""
+
+SMALLEST_HOLE = 20.0
+"""Smaller patches that a drive did not see are not told, square metres."""
 
 CLOSING = 8.0
 """Gaps narrower than twice this between such grounds count, too: the middle of a wide road, metres."""
@@ -33,16 +37,27 @@ def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None)
     """
     observed = global_map.provenance.get("observed")
     if observed and plane is not None:
-        rings = [shapely.Polygon(plane.from_wgs84(np.array(ring, dtype=np.float64))) for ring in observed]
-        return shapely.union_all([shapely.make_valid(ring) for ring in rings])
+        return ground_within([plane.from_wgs84(np.array(ring, dtype=np.float64)) for ring in observed])
     return near_elements(global_map)
 
 
 def observed_rings(ground: shapely.Geometry, georeference: Georeference) -> list[list[list[float]]]:
-    """Return ground (metres) as it is written to ``provenance["observed"]``: outer rings in degrees, holes filled."""
+    """Return ground (metres) as it is written to ``provenance["observed"]``: rings in degrees, holes as rings, too."""
+    simple = shapely.simplify(ground, 1.0)
+    return [np.round(georeference.to_wgs84(ring), 7).tolist() for ring in rings_around(simple, SMALLEST_HOLE)]
+
+
+def ground_within(rings: Sequence[Float]) -> shapely.Geometry:
+    """Return what lies within an odd number of rings ``(n, 2)``, so that a ring within another is a hole."""
+    polygons = (shapely.make_valid(shapely.Polygon(ring)) for ring in rings)
+    return reduce(shapely.symmetric_difference, polygons, shapely.Polygon())
+
+
+def rings_around(ground: shapely.Geometry, smallest_hole: float = 0.0) -> list[Float]:
+    """Return the rings ``(n, 2)`` of ground, those of holes of at least some area (square of its unit) among them."""
     parts = [part for part in shapely.get_parts(ground) if part.geom_type == "Polygon"]
-    rings = [shapely.get_coordinates(shapely.simplify(part, 1.0).exterior) for part in parts]
-    return [np.round(georeference.to_wgs84(ring), 7).tolist() for ring in rings]
+    holes = [hole for part in parts for hole in part.interiors if shapely.Polygon(hole).area >= smallest_hole]
+    return [shapely.get_coordinates(ring) for ring in (*(part.exterior for part in parts), *holes)]
 
 
 def near_elements(elements: Iterable[MapElement]) -> shapely.Geometry:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mapfusion.alignment import Alignment, Landmarks, align, landmarks
-from mapfusion.coverage import coverage
+from mapfusion.coverage import coverage, ground_within, rings_around
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.export.geojson import InvertibleGeoreference
 from mapfusion.export.plane import LocalPlane, common_plane
@@ -85,6 +85,7 @@ class _Entry:
     high: Float
     evidence: float
     digest: str
+    observed: list[list[list[float]]] | None
 
     @property
     def centre(self) -> Float:
@@ -192,6 +193,9 @@ def merge_files(
     names = short_names(paths)
     merge = _Merge(_Shelf(list(paths), plane), names, config or MergeConfig())
     told = {"generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
+    observed = merge.observed()
+    if observed is not None:
+        told["observed"] = observed
     with MapWriter(out, plane, told) as writer:
         for element in merge.elements(jobs, progress):
             writer.write(element)
@@ -232,6 +236,13 @@ class _Merge:
         self.counts = {kind.label: 0 for kind in ElementKind}
         self.metres = {kind.label: 0.0 for kind in ElementKind}
         self.tile_count = 0
+
+    def observed(self) -> list[list[list[float]]] | None:
+        """Return the ground that the maps together have observed, rings in degrees, if each of them says its own."""
+        if not self.entries or not all(entry.observed for entry in self.entries):
+            return None
+        grounds = [ground_within([np.array(ring) for ring in entry.observed or ()]) for entry in self.entries]
+        return [np.round(ring, 7).tolist() for ring in rings_around(shapely.union_all(grounds))]
 
     def elements(self, jobs: int, progress: Progress | None) -> Iterator[MapElement]:
         """Correct the poses, then yield the elements of the result in the order of the tiles."""
@@ -345,7 +356,9 @@ def _entry(shelf: _Shelf, place: int, name: str) -> _Entry | None:
     for row in sorted((int(e.kind), e.confidence, e.observations, np.round(e.points, 4).tobytes()) for e in raw):
         digest.update(repr(row).encode())
     evidence = sum(element.length * element.observations for element in raw)
-    return _Entry(name, place, points.min(axis=0), points.max(axis=0), round(evidence, 3), digest.hexdigest())
+    low, high = points.min(axis=0), points.max(axis=0)
+    observed = raw.provenance.get("observed")
+    return _Entry(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed)
 
 
 def _partners(entries: Sequence[_Entry], most: int) -> list[tuple[int, list[int]]]:

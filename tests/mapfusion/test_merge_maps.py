@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 import shapely
 
-from mapfusion import ElementKind, GlobalMap, MapElement
+from mapfusion import ElementKind, GlobalMap, MapElement, MapIntegrator
 from mapfusion.alignment import align, landmarks, move
+from mapfusion.coverage import coverage, near_elements, observed_rings
 from mapfusion.export.plane import LocalPlane
 from mapfusion.geometry import arc_length
 from mapfusion.io import read_map, write_map
 from mapfusion.merge import MergeConfig, merge_files, merge_maps, short_names
-from tests.mapfusion.simulation import town_road
+from tests.mapfusion.map_quality import measure
+from tests.mapfusion.simulation import simulate, town_road
 
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
 
@@ -198,13 +200,16 @@ def test_files_merge_with_provenance_and_a_copy_counts_once(tmp_path):
     paths = [tmp_path / name / "map.geojson" for name in ("log-1", "log-2", "copy")]
     for path, global_map in zip(paths, [*maps, maps[0]], strict=True):
         path.parent.mkdir()
-        write_map(global_map, path, plane)
+        seen = observed_rings(near_elements(global_map), plane)
+        write_map(global_map, path, plane, {"observed": seen})
     report = merge_files(paths, tmp_path / "city.geojson", jobs=2)
     assert len(report.duplicates) == 1
     city = read_map(tmp_path / "city.geojson", plane)
     assert sum(report.elements.values()) == len(city)
     assert city.provenance["sources"] == ["copy/map", "log-1/map", "log-2/map"]
     assert any(len(e.sources) == 2 for e in city)
+    ground = shapely.union_all([near_elements(m) for m in maps])
+    assert coverage(city, plane).symmetric_difference(ground).area < 0.1 * ground.area
     expected, _ = merge_maps(maps)
     assert city.length(BOUNDARY) == pytest.approx(expected.length(BOUNDARY), rel=0.01)
 
@@ -225,3 +230,33 @@ def test_a_kerb_around_a_block_is_closed_however_the_drives_cut_it():
     (kerb,) = merged.of_kind(BOUNDARY)
     np.testing.assert_allclose(kerb.points[0], kerb.points[-1], atol=1e-6)
     assert kerb.length == pytest.approx(480.0, abs=3.0)
+
+
+@pytest.mark.parametrize("seed", [2])
+def test_four_drives_together_are_better_than_one(seed):
+    truth, road = town_road(np.random.default_rng(seed))
+    poses = [road.pose(30.0 + 4.5 * number, -1.75) for number in range(40)]
+    drives = [simulate(truth, poses, np.random.default_rng(100 + k)) for k in range(4)]
+    rng = np.random.default_rng(seed)
+    maps = []
+    for drive in drives:
+        integrator = MapIntegrator()
+        for frame in drive.frames:
+            integrator.add(frame)
+        maps.append(integrator.map())
+    offsets = [(rng.normal(0, 0.8, 2), np.radians(rng.normal(0, 0.15))) for _ in maps]
+    centre = np.concatenate([e.points for e in truth]).mean(axis=0)
+    moved = [
+        GlobalMap(tuple(replace(e, points=move(e.points, centre, *offset)) for e in found))
+        for found, offset in zip(maps, offsets, strict=True)
+    ]
+    merged, report = merge_maps(moved)
+    assert all(status.partners == 3 for status in report.maps)
+    back = align(landmarks(merged), landmarks(truth))
+    merged = GlobalMap(tuple(replace(e, points=back.apply(e.points)) for e in merged))
+    together, alone = measure(merged, drives[0]), [measure(found, drives[0]) for found in maps]
+    assert together.precision >= np.mean([q.precision for q in alone]) - 0.002
+    assert together.recall >= np.mean([q.recall for q in alone]) - 0.002
+    assert together.lateral < 0.9 * np.mean([q.lateral for q in alone])
+    assert together.elements_per_true <= 1.2
+    assert together.ghosts_alive == 0
