@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 NEAR = 8.0
 """Ground within this distance of an element that was found counts as looked at, metres."""
 
+RIM = 2.0
+"""This close to the edge of what was seen, nothing found means nothing, metres."""
+
 SMALLEST_HOLE = 20.0
 """Smaller patches that a drive did not see are not told, square metres."""
 
@@ -37,8 +40,10 @@ def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None)
     """
     observed = global_map.provenance.get("observed")
     if observed and plane is not None:
-        return ground_within([plane.from_wgs84(np.array(ring, dtype=np.float64)) for ring in observed])
-    return near_elements(global_map)
+        ground = ground_within([plane.from_wgs84(np.array(ring, dtype=np.float64)) for ring in observed])
+    else:
+        ground = near_elements(global_map)
+    return shapely.buffer(ground, -RIM, quad_segs=2)
 
 
 def observed_rings(ground: shapely.Geometry, georeference: Georeference) -> list[list[list[float]]]:
@@ -61,10 +66,11 @@ def rings_around(ground: shapely.Geometry, smallest_hole: float = 0.0) -> list[F
 
 
 def near_elements(elements: Iterable[MapElement]) -> shapely.Geometry:
-    """Return the ground near elements, gaps closed, metres."""
+    """Return the ground beside elements, gaps closed, metres; past the end of a line nothing is known."""
     lines = shapely.simplify([shapely.LineString(element.points) for element in elements], 0.5)
-    grown = shapely.union_all(shapely.buffer(lines, NEAR + CLOSING, quad_segs=2))
-    return shapely.simplify(shapely.buffer(grown, -CLOSING, quad_segs=2), 0.5)
+    beside = shapely.union_all(shapely.buffer(lines, NEAR, quad_segs=2, cap_style="flat"))
+    closed = shapely.buffer(shapely.buffer(beside, CLOSING, quad_segs=2), -CLOSING, quad_segs=2)
+    return shapely.simplify(closed, 0.5)
 
 
 def inside(ground: shapely.Geometry, points: Float) -> NDArray[np.bool_]:

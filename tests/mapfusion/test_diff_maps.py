@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.coverage import observed_rings
+from mapfusion.coverage import RIM, observed_rings
 from mapfusion.diff import Change, DiffConfig, diff_maps, settle, write_diff
 from mapfusion.export.plane import LocalPlane
 from mapfusion.geometry import resample
@@ -151,7 +151,7 @@ def test_the_ground_that_a_drive_says_it_saw_decides_between_removed_and_unobser
     seen = shapely.box(-30.0, -15.0, 120.0, 40.0).difference(shapely.box(20.0, 20.0, 60.0, 30.0))
     rings = observed_rings(seen, plane)
     found = diff_maps(GlobalMap((kerb, far)), GlobalMap((kerb,), {"observed": rings}), plane, DiffConfig(align=False))
-    assert found.metres(Change.REMOVED, BOUNDARY) == pytest.approx(80.0, abs=1.0)
-    assert found.metres(Change.UNOBSERVED, BOUNDARY) == pytest.approx(120.0, abs=1.0)
+    assert found.metres(Change.REMOVED, BOUNDARY) == pytest.approx(80.0 - 3 * RIM, abs=1.0)
+    assert found.metres(Change.UNOBSERVED, BOUNDARY) == pytest.approx(120.0 + 3 * RIM, abs=1.0)
     guessed = diff_maps(GlobalMap((kerb, far)), GlobalMap((kerb,)), plane, DiffConfig(align=False))
     assert guessed.metres(Change.REMOVED, BOUNDARY) == 0.0
