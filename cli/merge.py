@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from mapfusion.merge import MergeReport
+    from mapfusion.merge_report import MergeReport
 
 
 def merge(

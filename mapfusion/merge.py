@@ -24,6 +24,7 @@ from mapfusion.export.plane import LocalPlane, common_plane
 from mapfusion.io import MapWriter, read_box, read_map
 from mapfusion.merge_lines import Contribution, MergeConfig, fuse_lines
 from mapfusion.merge_poses import Correction, solve_corrections
+from mapfusion.merge_report import MapStatus, MergeReport, short_names
 from mapfusion.merge_rings import fuse_rings
 from mapfusion.tidy import tidy
 from mapfusion.tiles import Piece, Stitcher, Tile, cut_line, tiles_of
@@ -34,45 +35,6 @@ Progress = Callable[[int, int, str], None]
 
 CACHED_MAPS = 48
 """Maps that are held in memory at a time; neighbouring tiles need the same ones."""
-
-
-@dataclass(frozen=True)
-class MapStatus:
-    """What became of one of the maps.
-
-    Attributes:
-        name: of the map.
-        shift: how far it was moved, metres.
-        turn: and turned, degrees.
-        partners: how many others it was aligned with.
-        note: why it was not aligned, empty if it was.
-        apart: True for a map that contradicts the others: its elements are in the result as they are, not fused.
-    """
-
-    name: str
-    shift: float
-    turn: float
-    partners: int
-    note: str = ""
-    apart: bool = False
-
-
-@dataclass(frozen=True)
-class MergeReport:
-    """What came of a merge.
-
-    Attributes:
-        maps: one entry per map, by name.
-        duplicates: names of maps that are the same as another, and were counted once.
-        elements, metres: of the result, by label of the kind.
-        tiles: how many were fused.
-    """
-
-    maps: tuple[MapStatus, ...]
-    duplicates: tuple[str, ...]
-    elements: dict[str, int]
-    metres: dict[str, float]
-    tiles: int
 
 
 @dataclass(frozen=True)
@@ -200,21 +162,6 @@ def merge_files(
         for element in merge.elements(jobs, progress):
             writer.write(element)
     return merge.report()
-
-
-def short_names(paths: Sequence[Path]) -> list[str]:
-    """Name files by their stems, with as many folders before as it takes to tell them apart.
-
-    Raises:
-        ValueError: the same file is given twice.
-    """
-    for depth in range(1, max(len(path.parts) for path in paths) + 1 if paths else 1):
-        names = ["/".join((*path.parts[-depth:-1], path.stem)) for path in paths]
-        if len(set(names)) == len(names):
-            return names
-    if not paths:
-        return []
-    raise ValueError(f"a map is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
 
 
 class _Merge:

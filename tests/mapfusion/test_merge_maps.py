@@ -14,7 +14,9 @@ from mapfusion.coverage import RIM, coverage, near_elements, observed_rings
 from mapfusion.export.plane import LocalPlane
 from mapfusion.geometry import arc_length
 from mapfusion.io import read_map, write_map
-from mapfusion.merge import MergeConfig, merge_files, merge_maps, short_names
+from mapfusion.merge import merge_files, merge_maps
+from mapfusion.merge_lines import MergeConfig
+from mapfusion.merge_report import short_names
 from tests.mapfusion.map_quality import measure
 from tests.mapfusion.simulation import simulate, town_road
 

@@ -1,0 +1,61 @@
+"""What a merge has to tell: what became of each map, and how the maps are called."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class MapStatus:
+    """What became of one of the maps.
+
+    Attributes:
+        name: of the map.
+        shift: how far it was moved, metres.
+        turn: and turned, degrees.
+        partners: how many others it was aligned with.
+        note: why it was not aligned, empty if it was.
+        apart: True for a map that contradicts the others: its elements are in the result as they are, not fused.
+    """
+
+    name: str
+    shift: float
+    turn: float
+    partners: int
+    note: str = ""
+    apart: bool = False
+
+
+@dataclass(frozen=True)
+class MergeReport:
+    """What came of a merge.
+
+    Attributes:
+        maps: one entry per map, by name.
+        duplicates: names of maps that are the same as another, and were counted once.
+        elements, metres: of the result, by label of the kind.
+        tiles: how many were fused.
+    """
+
+    maps: tuple[MapStatus, ...]
+    duplicates: tuple[str, ...]
+    elements: dict[str, int]
+    metres: dict[str, float]
+    tiles: int
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Name files by their stems, with as many folders before as it takes to tell them apart.
+
+    Raises:
+        ValueError: the same file is given twice.
+    """
+    for depth in range(1, max(len(path.parts) for path in paths) + 1 if paths else 1):
+        names = ["/".join((*path.parts[-depth:-1], path.stem)) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+    if not paths:
+        return []
+    raise ValueError(f"a map is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
