@@ -126,7 +126,8 @@ def _moved(line: Float, motion: Float, kind: ElementKind, roi: RegionOfInterest)
     if kind.is_ring:
         box = shapely.box(-roi.length / 2, -roi.width / 2, roi.length / 2, roi.width / 2)
         inside = shapely.get_parts(shapely.intersection(shapely.make_valid(shapely.Polygon(moved)), box))
-        parts = [shapely.get_coordinates(part.exterior) for part in inside if part.geom_type == "Polygon"]
+        polygons = [part for part in inside if part.geom_type == "Polygon" and not part.is_empty]
+        parts = [shapely.get_coordinates(polygon.exterior) for polygon in polygons]
     else:
         parts = clip_line(moved, roi)
     if not parts:

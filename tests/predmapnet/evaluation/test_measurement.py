@@ -112,3 +112,10 @@ def test_the_same_scenes_give_the_same_bytes(tmp_path, case):
         write_report(tmp_path / f"{name}.html", measurement, CONTEXT)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
+
+
+def test_a_crossing_that_the_motion_takes_out_of_the_region_is_still_measured():
+    frames, _ = drive(count=16, speed=4.0)
+    assert any((frame.predicted.polylines[0].max(axis=0)[0] < -30.0) for frame in frames)
+    figures = pool_scenes([measure_scene(frames)]).figures()
+    assert np.isfinite(figures["forecast"]["t+1"]["ego_motion_mean_m"])
