@@ -239,7 +239,7 @@ def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | No
 
 def describe(provenance: Mapping[str, Any]) -> str:
     """Tell in Markdown what a recording shows, for someone who finds the file."""
-    note = f"\n\n**Mind.** {provenance['note']}" if "note" in provenance else ""
+    note = f"\n\n**Note.** {provenance['note']}" if "note" in provenance else ""
     return f"""# {provenance["scene"]} ({provenance["dataset"]}){note}
 
 PredMapNet {provenance["version"]} looks through the cameras at one instant after the other and draws
