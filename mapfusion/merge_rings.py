@@ -107,8 +107,8 @@ def _outline(cluster: _Cluster, config: MergeConfig) -> Float | None:
         return None
     outline = shapely.get_coordinates(polygons[0]) * CELL + low + 0.5 * CELL
     simple = shapely.simplify(shapely.Polygon(outline), config.simplify_tolerance)
-    ring: Float = shapely.get_coordinates(shapely.orient_polygons(simple))
-    return ring
+    fused: Float = shapely.get_coordinates(shapely.orient_polygons(simple))
+    return fused
 
 
 def _element(cluster: _Cluster, outline: Float, sure: float, names: Sequence[str], config: MergeConfig) -> MapElement:
