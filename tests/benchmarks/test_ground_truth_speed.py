@@ -1,6 +1,6 @@
 """Milliseconds per frame of ground truth, as ratios to what the official code took on the same maps and poses.
 
-    pytest -m benchmark_only -s tests/benchmarks/test_ground_truth_speed.py
+pytest -m benchmark_only -s tests/benchmarks/test_ground_truth_speed.py
 """
 
 import json
