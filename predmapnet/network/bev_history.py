@@ -67,8 +67,9 @@ def warp_grid(current_to_past: Tensor, config: MapTrackerConfig) -> Tensor:
     cells = _cells(config, current_to_past.device)
     rotation, translation = current_to_past[..., :2, :2], current_to_past[..., :2, 3]
     past = cells.flatten(0, 1) @ rotation.transpose(-1, -2) + translation[..., None, :]
-    half = past.new_tensor([config.roi_length / 2, -config.roi_width / 2]).float()
-    return (past.float() / half).unflatten(-2, cells.shape[:2])
+    x, y = past.float().unbind(-1)
+    grid = torch.stack([x / (config.roi_length / 2), -y / (config.roi_width / 2)], dim=-1)
+    return grid.unflatten(-2, cells.shape[:2])
 
 
 def _cells(config: MapTrackerConfig, device: torch.device) -> Tensor:
@@ -78,5 +79,5 @@ def _cells(config: MapTrackerConfig, device: torch.device) -> Tensor:
         x = torch.linspace(-length / 2, length / 2, config.columns, dtype=torch.float32, device=device)
         y = torch.linspace(width / 2, -width / 2, config.rows, dtype=torch.float32, device=device)
         return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).double()
-    normalised = cell_centres(config.rows, config.columns, device).double()
-    return (normalised - 0.5) * normalised.new_tensor([length, width])
+    x, y = (cell_centres(config.rows, config.columns, device).double() - 0.5).unbind(-1)
+    return torch.stack([x * length, y * width], dim=-1)

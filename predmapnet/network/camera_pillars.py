@@ -99,5 +99,6 @@ def _pillars(config: MapTrackerConfig) -> Tensor:
 
 def pixel_positions(positions: Tensor, level_sizes: Sequence[tuple[int, int]]) -> Tensor:
     """Turn positions ``(..., 2)`` in the image into pixels ``(..., L, 2)`` of each level; 0 is a pixel's centre."""
-    size = positions.new_tensor([(columns, rows) for rows, columns in level_sizes])
-    return positions[..., None, :] * size - 0.5
+    x, y = positions.unbind(-1)
+    levels = [torch.stack([x * columns, y * rows], dim=-1) for rows, columns in level_sizes]
+    return torch.stack(levels, dim=-2) - 0.5

@@ -209,10 +209,11 @@ def move_on_ground(points: Tensor, past_to_current: Tensor, config: MapTrackerCo
         past_to_current: ``(B, 4, 4) float64``.
         config: the region.
     """
-    size = past_to_current.new_tensor([config.roi_length, config.roi_width])
-    metres = ((points.double() - 0.5) * size).flatten(1, 2)
+    x, y = (points.double() - 0.5).flatten(1, 2).unbind(-1)
+    metres = torch.stack([x * config.roi_length, y * config.roi_width], dim=-1)
     moved = metres @ past_to_current[:, :2, :2].transpose(1, 2) + past_to_current[:, None, :2, 3]
-    return (moved / size + 0.5).clamp(0.0, 1.0).view(points.shape).to(points.dtype)
+    moved = torch.stack([moved[..., 0] / config.roi_length, moved[..., 1] / config.roi_width], dim=-1) + 0.5
+    return moved.clamp(0.0, 1.0).view(points.shape).to(points.dtype)
 
 
 def select_tracks(outputs: FrameOutputs, state: MapTrackerState | None, config: MapTrackerConfig) -> Selection:
