@@ -129,9 +129,11 @@ def say_report(report: SceneReport) -> None:
 
 def say_outcomes(outcomes: Sequence[Outcome], folder: Path) -> None:
     """Print one line per scene of a batch, and what failed with its reason."""
-    table = Table("scene", "", show_edge=False, pad_edge=False)
+    table = Table(show_edge=False, pad_edge=False, collapse_padding=True)
+    for heading in ("scene", ""):
+        table.add_column(heading, no_wrap=True)
     for heading in ("elements", "metres", "frames/s", "mAP", "precision", "recall"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for outcome in sorted(outcomes, key=lambda outcome: outcome.scene):
         table.add_row(outcome.scene, outcome.status, *_figures(outcome))
     out.print(table)
