@@ -86,7 +86,7 @@ def cut_line(points: Float, values: Float, low: Float, high: Float) -> list[tupl
     axes: list[tuple[int, float, Float]] = []
     for axis in range(2):
         for border in (float(low[axis]), float(high[axis])):
-            with np.errstate(divide="ignore", invalid="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 share = (border - start[:, axis]) / step[:, axis]
             rows = np.flatnonzero((share > 0.0) & (share < 1.0))
             at.append(rows + share[rows])

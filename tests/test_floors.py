@@ -1,0 +1,30 @@
+"""The rooms of the house: cli may use predmapnet and mapfusion, predmapnet may use mapfusion, never the other way."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.mark.parametrize(
+    ("room", "forbidden"),
+    [("mapfusion", {"predmapnet", "cli", "torch"}), ("predmapnet", {"cli"})],
+)
+def test_no_room_imports_from_above(room, forbidden):
+    for path in sorted((ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            assert not {name.split(".")[0] for name in names} & forbidden, path
+
+
+def test_mapfusion_comes_without_torch():
+    code = "import sys, mapfusion, mapfusion.integrator; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
