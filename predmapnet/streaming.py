@@ -11,6 +11,7 @@ from typing import Protocol
 from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
 from mapfusion.integrator import MapIntegrator
 from predmapnet.datasets.source import Frame, Scene
+from predmapnet.errors import UserError
 from predmapnet.mapper import CameraImages, Mapper
 
 MapSnapshot = Callable[[], GlobalMap]
@@ -86,8 +87,10 @@ def map_scene(
         allow_missing_cameras: go on where a camera has no image; otherwise that is an error.
 
     Raises:
-        UserError: an image is damaged or missing, or a pose is broken; the message says which.
+        UserError: there are no frames, an image is damaged or missing, or a pose is broken; the message says which.
     """
+    if len(scene) == 0:
+        raise UserError(f"{scene.info.name} has no frames: there is nothing to map.")
     integrator = MapIntegrator()
     for observer in observers:
         observer.begin(scene, mapper.roi)
