@@ -10,9 +10,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import multiprocessing
-import os
 import signal
-import threading
 import traceback
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -30,7 +28,7 @@ import predmapnet
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_whole
 from predmapnet.outputs import Outputs
-from predmapnet.threads import use_threads
+from predmapnet.threads import end_with_parent, use_threads
 
 if TYPE_CHECKING:
     from predmapnet.datasets.source import SceneSource
@@ -256,15 +254,8 @@ _pipeline: MappingPipeline | None = None
 def _begin_worker(settings: BatchSettings) -> None:
     # Ctrl-C is the parent's business; it ends its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     use_threads(settings.threads)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _map_one(scene: str, folder: Path, settings: BatchSettings, fingerprint: str) -> Outcome:

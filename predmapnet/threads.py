@@ -1,9 +1,11 @@
-"""How many CPU threads the process uses, everywhere at once."""
+"""How many CPU threads a process uses, everywhere at once, and when it ends."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import sys
+import threading
 
 
 def use_threads(count: int) -> int:
@@ -32,3 +34,15 @@ def use_threads(count: int) -> int:
 def available_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def end_with_parent() -> None:
+    """Let this process end as soon as the one that started it is gone, however that ended."""
+
+    def watch() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

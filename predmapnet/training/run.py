@@ -13,6 +13,7 @@ import torch
 from predmapnet.config import PredMapNetConfig, load_config
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.threads import end_with_parent
 from predmapnet.training import checkpoint
 from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.cache import DEMO, cache_folder, fill_demo_cache
@@ -113,6 +114,7 @@ def export(folder: Path, config: PredMapNetConfig, data: str) -> Path:
 
 def _other_process(options: RunOptions, rank: int, meeting_point: Path) -> None:
     """Body of every process but the first; it says nothing."""
+    end_with_parent()
     _train_process(options, Workers(rank, options.processes), meeting_point, lambda _line: None)
 
 
