@@ -114,6 +114,8 @@ class FutureConfig(Section):
     histories: Positive = 4
     """n of the paper."""
     hidden: Positive = 256
+    steady_motion: bool = False
+    """The forecast starts from the last step of the car, taken once more; off, the polylines alone tell (the paper)."""
 
 
 class DecoderConfig(Section):
@@ -203,7 +205,7 @@ class PredMapNetConfig(Section):
         return self.model_dump_json()
 
 
-PRESETS = {"lite": PredMapNetConfig(name="lite")}
+PRESETS = {"lite": PredMapNetConfig(name="lite", future=FutureConfig(steady_motion=True))}
 
 
 def preset(name: str) -> PredMapNetConfig:

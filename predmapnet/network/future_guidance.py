@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.network.ego_motion import move_points
 from predmapnet.network.layers import Perceptron, sine_code, zero_init
 
 FREQUENCIES = 6
@@ -15,24 +16,28 @@ class ShortTermFutureGuidance(nn.Module):
     """A perceptron over the last n polylines forecasts the next one; its embedding is fused into the query.
 
     Each polyline is given in the ego frame of its own instant, so the motion of the car shows in them; the motion of
-    the next step is not known when the forecast is made and has to be guessed from them.
+    the next step is not known when the forecast is made. In the paper the perceptron guesses it from the polylines;
+    with ``steady_motion`` the last step of the car is taken once more, and the perceptron only corrects that.
     """
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
         width, points, histories = config.decoder.width, config.decoder.points, config.future.histories
         hidden = config.future.hidden
+        self.steady_motion = config.future.steady_motion
+        self.roi = config.roi
         self.offsets = Perceptron(histories * (2 * points + 1), hidden, hidden, 2 * points, zero_last=True)
         self.point_embedding = Perceptron(4 * FREQUENCIES, width, width)
         self.fusion = nn.Linear(2 * width, width)
         zero_init(self.fusion)
 
-    def forecast(self, history: Tensor, valid: Tensor) -> Tensor:
+    def forecast(self, history: Tensor, valid: Tensor, last_step: Tensor) -> Tensor:
         """Predict the polylines in the ego frame of t + 1 (eq. 10).
 
         Args:
             history: ``(B, T, n, P, 2)``, normalised, oldest first, padded by the oldest one.
             valid: ``(B, T, n) bool``, False in padding.
+            last_step: ``(B, 2, 3)``, metres: motion of the ground from the ego frame of t - 1 to that of t.
 
         Returns:
             ``(B, T, P, 2)``, normalised.
@@ -41,7 +46,8 @@ class ShortTermFutureGuidance(nn.Module):
         last = history[:, :, -1]
         motion = (history[:, :, :-1] - last[:, :, None]) * valid[:, :, :-1, None, None]
         seen = torch.cat([10.0 * motion.flatten(2), last.flatten(2) - 0.5, valid.to(last.dtype)], dim=-1)
-        return last + self.offsets(seen).unflatten(-1, last.shape[-2:]) / 10.0
+        start = move_points(last, last_step, self.roi) if self.steady_motion else last
+        return start + self.offsets(seen).unflatten(-1, last.shape[-2:]) / 10.0
 
     def forward(self, queries: Tensor, forecasts: Tensor) -> Tensor:
         """Fuse the forecast that was made for this instant into the track queries (eq. 11 and 12).

@@ -212,7 +212,8 @@ class PredMapNet(nn.Module):
         )
         forecasts = instances.points
         if self.future_guidance is not None:
-            forecasts = self.future_guidance.forecast(history, history_valid)
+            last_step = last_motion(state, inputs.ego_to_global)
+            forecasts = self.future_guidance.forecast(history, history_valid, last_step)
         maps, poses, valid = remember_bev(state, outputs.bev, inputs.ego_to_global, self.config.temporal_bev.spacing)
         newest = torch.cat([instances.track_ids, state.next_track_id[:, None] - 1], dim=1).amax(dim=1)
         return StreamState(
@@ -227,3 +228,10 @@ class PredMapNet(nn.Module):
             bev_memory_pose=poses,
             bev_memory_valid=valid,
         )
+
+
+def last_motion(state: StreamState, ego_to_global: Tensor) -> Tensor:
+    """Return how the ground moved ``(B, 2, 3)`` since the last frame; not at all in streams without a track so far."""
+    motion = relative_motion(state.ego_to_global, ego_to_global)
+    still = torch.eye(2, 3, device=motion.device)
+    return torch.where((state.next_track_id > 0)[:, None, None], motion, still)
