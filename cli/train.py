@@ -19,6 +19,9 @@ def train(
     batch: Annotated[int, typer.Option(min=1, help="Frames per step, over all processes.")] = 6,
     processes: Annotated[int, typer.Option(min=1, help="Processes that share every step.")] = 2,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
+    learning_rate: Annotated[
+        float, typer.Option(min=1e-6, help="Peak of the single-frame stage; take less to go on from good weights.")
+    ] = 1e-3,
     seed: Annotated[int, typer.Option(help="Seed of weights and draws.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
     init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
@@ -35,6 +38,7 @@ def train(
     from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.errors import UserError
     from predmapnet.training import run
+    from predmapnet.training.optimiser import OptimiserSettings
     from predmapnet.training.settings import Budget, TrainingSettings
 
     run.check_data(data)
@@ -53,7 +57,13 @@ def train(
         validation_towns=10,
         processes=processes,
         threads=threads,
-        settings=TrainingSettings(batch=batch, seed=seed, single=single, temporal=temporal),
+        settings=TrainingSettings(
+            batch=batch,
+            seed=seed,
+            single=single,
+            temporal=temporal,
+            optimiser=OptimiserSettings(learning_rate=learning_rate),
+        ),
         resume=resume,
         initial=init,
     )

@@ -24,7 +24,7 @@ from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
 from predmapnet.training.validation import validate
 from predmapnet.training.workers import Workers
-from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint, weights_hash
 
 Report = Callable[[str], None]
 
@@ -90,25 +90,28 @@ def train(options: RunOptions, report: Report = print) -> Path | None:
             process.join()
     finally:
         meeting_point.unlink(missing_ok=True)
-    return export(options.folder, options.config, options.data) if finished else None
+    return export(options) if finished else None
 
 
-def export(folder: Path, config: PredMapNetConfig, data: str) -> Path:
-    """Write the averaged weights of the newest checkpoint in ``folder`` as a file of their own.
+def export(options: RunOptions) -> Path:
+    """Write the averaged weights of the newest checkpoint of a run as a file of their own.
 
     Raises:
         UserError: there is no checkpoint.
     """
-    newest = checkpoint.latest(folder)
+    newest = checkpoint.latest(options.folder)
     if newest is None:
-        raise UserError(f"There is no checkpoint in {folder}.")
-    network = PredMapNet(config)
+        raise UserError(f"There is no checkpoint in {options.folder}.")
+    network = PredMapNet(options.config)
     average = checkpoint.below_prefix("average", checkpoint.read(newest, "network"))
     checkpoint.load_weights(network, average, newest)
     position = checkpoint.read_json(newest / "position.json")
     facts = {name: position[name] for name in ("frames", "finished", "cpu_seconds")}
-    path = folder / WEIGHTS
-    save_checkpoint(path, network, {"data": data, **facts})
+    facts |= {"data": options.data, "towns": options.towns, "seed": options.settings.seed}
+    if options.initial is not None:
+        facts["initial_sha256"] = weights_hash(options.initial)
+    path = options.folder / WEIGHTS
+    save_checkpoint(path, network, facts)
     return path
 
 
