@@ -101,7 +101,7 @@ def candidates(
     # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
     squares = np.bincount(owner, weights=match.distance**2, minlength=len(local.elements))
     beside = np.flatnonzero(count)
-    fused = [lines[int(local.elements[i])].evidence.tracks.get(observation.track_id, 0) for i in beside]
+    fused = [lines[int(local.elements[i])].evidence.tracks.get(observation.track, 0) for i in beside]
     most = max(max(fused), 1)
     found = []
     for position, frames in zip(beside, fused, strict=True):

@@ -131,6 +131,6 @@ def _element(
         observations=evidence.observations,
         first_seen=evidence.first_seen,
         last_seen=evidence.last_seen,
-        track_ids=tuple(sorted(evidence.tracks)),
+        track_ids=tuple(sorted({track for _, track in evidence.tracks})),
         deviation=deviation,
     )

@@ -72,7 +72,8 @@ class MapIntegrator:
 
         Args:
             frame_map: what the mapper saw.
-            log: name of the drive; poses are checked against other frames of the same drive only.
+            log: name of the drive; poses are checked against other frames of the same drive only, and equal track
+                ids of two drives are two tracks.
         """
         problem = pose_problem(frame_map.ego_to_global) or self.journal.enter(
             log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed
@@ -80,7 +81,7 @@ class MapIntegrator:
         if problem is not None:
             self.rejections[problem] += 1
             return
-        lines, rings = observe(frame_map, self.config, self.rejections)
+        lines, rings = observe(frame_map, self.config, self.rejections, log)
         self.frames += 1
         self.views.add(frame_map.ego_to_global, frame_map.roi)
         reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + 2.0
@@ -185,13 +186,13 @@ class MapIntegrator:
     ) -> list[Curve]:
         line = self.lines[element]
         line.curve, pieces = fuse(line.curve, _curve(observation), match)
-        line.evidence.sighted(observation.track_id, timestamp, again)
+        line.evidence.sighted(observation.track, timestamp, again)
         self.index.put(element, line.curve.points)
         self._dirty.add(element)
         return pieces
 
     def _new_line(self, observation: Observation, curve: Curve, timestamp: int) -> None:
-        evidence = Evidence(timestamp, timestamp, tracks={observation.track_id: 1})
+        evidence = Evidence(timestamp, timestamp, tracks={observation.track: 1})
         self.put_line(self.next_id, FusedLine(observation.kind, curve, evidence))
         self.next_id += 1
 

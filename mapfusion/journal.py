@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +14,31 @@ Float = NDArray[np.float64]
 STANDSTILL = 3.0
 """Positions this close never count as a jump, metres."""
 
+NEIGHBOURS = 3
+"""Frames before and after that a pose is judged by."""
+
+
+@dataclass
+class LogBook:
+    """The frames of one log in the order of time: nanoseconds, metres, and whether each was believed."""
+
+    times: list[int] = field(default_factory=list)
+    positions: list[tuple[float, float]] = field(default_factory=list)
+    believed: list[bool] = field(default_factory=list)
+
 
 class Journal:
-    """Timestamps and positions of the frames of each log, in the order of time."""
+    """What is known of the frames of each log."""
 
     def __init__(self) -> None:
-        self.logs: dict[str, tuple[list[int], list[tuple[float, float]]]] = {}
+        self.logs: dict[str, LogBook] = {}
 
     def enter(self, log: str, timestamp: int, position: Float, max_speed: float) -> str | None:
-        """Note a frame, unless it repeats one or no car could have come there from the frames around it in time.
+        """Note a frame and say whether it repeats one, or whether the car can hardly have been there.
+
+        The frames around it in time vote, believed ones with two votes: those between which and here a car could
+        have driven against the others. So no frame is beyond doubt. If the first pose of a log is the wrong one, or
+        if a log goes on at another place for good, two frames are refused and the rest is believed.
 
         Args:
             log: name of the drive.
@@ -31,18 +49,17 @@ class Journal:
         Returns:
             What is wrong with the frame, or None.
         """
-        times, positions = self.logs.setdefault(log, ([], []))
-        place = bisect_left(times, timestamp)
-        if place < len(times) and times[place] == timestamp:
+        book = self.logs.setdefault(log, LogBook())
+        place = bisect_left(book.times, timestamp)
+        if place < len(book.times) and book.times[place] == timestamp:
             return "frame repeated"
-        around = range(max(place - 1, 0), min(place + 1, len(times)))
-        jumps = [
-            float(np.hypot(position[0] - positions[i][0], position[1] - positions[i][1]))
-            > STANDSTILL + max_speed * abs(timestamp - times[i]) * 1e-9
-            for i in around
-        ]
-        if any(jumps):
-            return "pose jumps"
-        times.insert(place, int(timestamp))
-        positions.insert(place, (float(position[0]), float(position[1])))
-        return None
+        x, y = float(position[0]), float(position[1])
+        votes = 0
+        for i in range(max(place - NEIGHBOURS, 0), min(place + NEIGHBOURS, len(book.times))):
+            distance = math.hypot(x - book.positions[i][0], y - book.positions[i][1])
+            near = distance <= STANDSTILL + max_speed * abs(timestamp - book.times[i]) * 1e-9
+            votes += (1 if near else -1) * (2 if book.believed[i] else 1)
+        book.times.insert(place, int(timestamp))
+        book.positions.insert(place, (x, y))
+        book.believed.insert(place, votes >= 0)
+        return None if votes >= 0 else "pose jumps"

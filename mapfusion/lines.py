@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind
 from mapfusion.matching import Correspondence, correspond, tangents
+from mapfusion.observations import Track
 
 Float = NDArray[np.float64]
 
@@ -23,26 +24,27 @@ class Evidence:
     first_seen: int
     last_seen: int
     observations: int = 1
-    tracks: dict[int, int] = field(default_factory=dict)
-    """Track id to the number of frames in which it was fused into this element."""
+    tracks: dict[Track, int] = field(default_factory=dict)
+    """Track to the number of frames in which it was fused into this element."""
     beside: dict[int, int] = field(default_factory=dict)
     """Element id to the number of frames that showed it beside this one."""
 
-    def sighted(self, track_id: int, timestamp: int, again: bool = False) -> None:
+    def sighted(self, track: Track, timestamp: int, again: bool = False) -> None:
         """Count one frame of a track; ``again`` where another observation of the same frame was counted."""
         self.first_seen = min(self.first_seen, timestamp)
         self.last_seen = max(self.last_seen, timestamp)
         self.observations += not again
-        self.tracks[track_id] = self.tracks.get(track_id, 0) + 1
+        self.tracks[track] = self.tracks.get(track, 0) + 1
 
     def absorb(self, other: Evidence) -> None:
         """Add what is known of an element that turned out to be this one."""
         self.first_seen = min(self.first_seen, other.first_seen)
         self.last_seen = max(self.last_seen, other.last_seen)
         self.observations += other.observations
-        for counts, more in ((self.tracks, other.tracks), (self.beside, other.beside)):
-            for key, count in more.items():
-                counts[key] = counts.get(key, 0) + count
+        for track, count in other.tracks.items():
+            self.tracks[track] = self.tracks.get(track, 0) + count
+        for element, count in other.beside.items():
+            self.beside[element] = self.beside.get(element, 0) + count
 
 
 @dataclass

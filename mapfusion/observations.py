@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import shapely
@@ -16,6 +17,12 @@ from mapfusion.views import view_weight
 
 Float = NDArray[np.float64]
 
+Track: TypeAlias = tuple[str, int]
+"""A track of a drive: name of the log, id within it. Different logs count their tracks from the same number."""
+
+SURE_SCORE = 0.5
+"""A detection with this score is a whole sighting."""
+
 
 @dataclass(frozen=True)
 class Observation:
@@ -23,15 +30,16 @@ class Observation:
 
     Attributes:
         kind: what it is.
-        track_id: of its log.
+        track: its log and its id there.
         score: in ``[0, 1]``.
         points: ``(n, 2) float64``, metres, global frame; lines have vertices one station apart.
         information: ``(n,) float64``, inverse variance across the line, 1 / m².
-        view: ``(n,) float64``, view weight at each vertex.
+        view: ``(n,) float64``, how much of a look at each vertex the sighting answers: the view weight, less below
+            :data:`SURE_SCORE`, where the element was in part missed (a track that coasts).
     """
 
     kind: ElementKind
-    track_id: int
+    track: Track
     score: float
     points: Float
     information: Float
@@ -39,14 +47,14 @@ class Observation:
 
     @property
     def sighting(self) -> float:
-        """What the sighting counts for: 1 at score 0.5, between 0.5 and 1.5."""
-        return float(np.clip(2.0 * self.score, 0.5, 1.5))
+        """What the sighting counts for: 1 at :data:`SURE_SCORE`, in proportion to the score, at most 1.5."""
+        return min(self.score / SURE_SCORE, 1.5)
 
     def part(self, start: int, stop: int) -> Observation:
         """Return the observation of vertices ``start`` to ``stop`` (excluded)."""
         piece = slice(start, stop)
         return Observation(
-            self.kind, self.track_id, self.score, self.points[piece], self.information[piece], self.view[piece]
+            self.kind, self.track, self.score, self.points[piece], self.information[piece], self.view[piece]
         )
 
 
@@ -64,7 +72,7 @@ def pose_problem(ego_to_global: Float) -> str | None:
 
 
 def observe(
-    frame_map: FrameMap, config: IntegratorConfig, rejections: Counter[str]
+    frame_map: FrameMap, config: IntegratorConfig, rejections: Counter[str], log: str = ""
 ) -> tuple[list[Observation], list[Observation]]:
     """Return the lines and the rings of a frame that can be fused.
 
@@ -72,6 +80,7 @@ def observe(
         frame_map: one instant; only tracked elements are used.
         config: spacing and error model.
         rejections: counted up by reason for every element that is left out.
+        log: name of the drive.
 
     Returns:
         Lines (clipped to the ROI, resampled) and rings.
@@ -96,12 +105,12 @@ def observe(
                 continue
             rows.append(row)
             curves.append(curve)
-    observations = _observations(frame_map, rows, curves, config)
+    observations = _observations(frame_map, rows, curves, config, log)
     return [o for o in observations if not o.kind.is_ring], [o for o in observations if o.kind.is_ring]
 
 
 def _observations(
-    frame_map: FrameMap, rows: list[int], curves: list[Float], config: IntegratorConfig
+    frame_map: FrameMap, rows: list[int], curves: list[Float], config: IntegratorConfig, log: str
 ) -> list[Observation]:
     """Say where the points of curves of the ego frame lie and what they are worth, all at once."""
     if not rows:
@@ -117,11 +126,11 @@ def _observations(
         observations.append(
             Observation(
                 kind=ElementKind(int(frame_map.kinds[row])),
-                track_id=int(frame_map.track_ids[row]),
+                track=(log, int(frame_map.track_ids[row])),
                 score=score,
                 points=points[start:stop],
                 information=max(score, 0.05) / deviation[start:stop] ** 2,
-                view=view[start:stop],
+                view=view[start:stop] * min(score / SURE_SCORE, 1.0),
             )
         )
     return observations

@@ -191,7 +191,7 @@ def _signed_distance(x: Float, y: Float, ring: Float, counts: NDArray[np.bool_])
 def new_ring(sighting: RingSighting, timestamp: int) -> FusedRing:
     """Start a crossing from its first observation."""
     zero = np.zeros(sighting.visible.shape, dtype=np.float32)
-    tracks = {sighting.observation.track_id: 0}
+    tracks = {sighting.observation.track: 0}
     ring = FusedRing(
         sighting.corner, zero, zero.copy(), zero.copy(), 0.0, Evidence(timestamp, timestamp, 0, tracks=tracks)
     )
@@ -209,7 +209,7 @@ def fuse_ring(ring: FusedRing, sighting: RingSighting, timestamp: int) -> None:
     ring.looked[window] += information
     ring.seen_view[window] += sighting.visible * np.float32(observation.view.mean())
     ring.seen += observation.sighting
-    ring.evidence.sighted(observation.track_id, timestamp)
+    ring.evidence.sighted(observation.track, timestamp)
 
 
 def merge_rings(ring: FusedRing, other: FusedRing) -> None:
@@ -238,4 +238,4 @@ def overlap(ring: FusedRing, sighting: RingSighting) -> float:
 
 def ring_match_threshold(ring: FusedRing, observation: Observation, config: IntegratorConfig) -> float:
     """Return the overlap that a match takes: less where the track is known."""
-    return config.ring_overlap * (0.5 if observation.track_id in ring.evidence.tracks else 1.0)
+    return config.ring_overlap * (0.5 if observation.track in ring.evidence.tracks else 1.0)

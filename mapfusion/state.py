@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from mapfusion.config import IntegratorConfig
 from mapfusion.elements import ElementKind
+from mapfusion.journal import LogBook
 from mapfusion.lines import Curve, Evidence, FusedLine
 from mapfusion.rings import FusedRing
 
 if TYPE_CHECKING:
     from mapfusion.integrator import MapIntegrator
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file's layout; files of another version are refused."""
 
 Item = TypeVar("Item")
@@ -42,7 +43,7 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
         "rejections": dict(integrator.rejections),
         "frames": integrator.frames,
         "next_id": integrator.next_id,
-        "logs": integrator.journal.logs,
+        "logs": {log: [book.times, book.positions, book.believed] for log, book in integrator.journal.logs.items()},
         "lines": [
             {"id": i, "kind": int(line.kind), "count": len(line.curve), "evidence": _plain(line.evidence)}
             for i, line in lines.items()
@@ -104,7 +105,8 @@ def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str
     integrator.rejections = Counter(header["rejections"])
     integrator.frames, integrator.next_id = header["frames"], header["next_id"]
     integrator.journal.logs = {
-        log: (times, [(x, y) for x, y in positions]) for log, (times, positions) in header["logs"].items()
+        log: LogBook(times, [(x, y) for x, y in positions], believed)
+        for log, (times, positions, believed) in header["logs"].items()
     }
     points = arrays["points"].reshape(-1, 2)
     at = 0
@@ -135,10 +137,10 @@ def _flat(items: Iterable[Item], part: Callable[[Item], NDArray[Any]], dtype: ty
 
 
 def _plain(evidence: Evidence) -> list[Any]:
-    tracks, beside = ([list(pair) for pair in counts.items()] for counts in (evidence.tracks, evidence.beside))
-    return [evidence.first_seen, evidence.last_seen, evidence.observations, tracks, beside]
+    tracks = [[*track, count] for track, count in evidence.tracks.items()]
+    return [evidence.first_seen, evidence.last_seen, evidence.observations, tracks, list(evidence.beside.items())]
 
 
 def _evidence(plain: list[Any]) -> Evidence:
     first, last, observations, tracks, beside = plain
-    return Evidence(first, last, observations, {k: v for k, v in tracks}, {k: v for k, v in beside})
+    return Evidence(first, last, observations, {(log, track): count for log, track, count in tracks}, dict(beside))

@@ -161,6 +161,67 @@ def test_broken_input_is_counted_and_changes_nothing(broken, reason):
     assert [e.points.tolist() for e in integrator.map()] == [e.points.tolist() for e in before]
 
 
+def straight_drive(count: int, start: float = 0.0) -> list[FrameMap]:
+    """A car at 10 m/s past a line that lies 3 m to its left."""
+    return [
+        frame_map([[[-30, 3], [30, 3]]], number=n, ego_to_global=pose(start + 5.0 * n, 0, 0), tracks=[4])
+        for n in range(count)
+    ]
+
+
+def test_a_log_whose_first_pose_is_wrong_is_mapped_all_the_same():
+    frames = straight_drive(20)
+    frames[0] = replace(frames[0], ego_to_global=pose(90_000, 0, 0))
+    integrator = MapIntegrator()
+    for frame in frames:
+        integrator.add(frame)
+    assert integrator.rejections == {"pose jumps": 2}
+    assert [e.length for e in integrator.map()] == [pytest.approx(135.0, abs=10.0)]
+
+
+@pytest.mark.parametrize("wrong", [{9}, {9, 10}, {6, 14}, {18, 19}])
+def test_poses_that_jump_for_a_moment_cost_only_their_own_frames(wrong):
+    frames = straight_drive(20)
+    for number in wrong:
+        frames[number] = replace(frames[number], ego_to_global=pose(90_000, 0, 0))
+    integrator = MapIntegrator()
+    for frame in frames:
+        integrator.add(frame)
+    assert integrator.rejections == {"pose jumps": len(wrong)}
+    assert len(integrator.map()) == 1
+
+
+def test_a_log_that_goes_on_elsewhere_is_believed_after_two_frames():
+    integrator = MapIntegrator()
+    for number, frame in enumerate(straight_drive(20)):
+        integrator.add(frame if number < 10 else replace(frame, ego_to_global=pose(90_000 + 5.0 * number, 0, 0)))
+    assert integrator.rejections == {"pose jumps": 2}
+    assert len(integrator.map()) == 2
+
+
+def test_equal_track_ids_of_two_drives_are_two_tracks():
+    # the second drive's track 7 runs between the lines; its id must not draw it to the first drive's track 7
+    lines = [[[-20, 0], [20, 0]], [[-20, 1.6], [20, 1.6]]]
+    found = {}
+    for second in ("first", "second"):
+        integrator = MapIntegrator()
+        for number in range(6):
+            integrator.add(frame_map(lines, number=number, tracks=[7, 8]), "first")
+        integrator.add(frame_map([[[-20, 0.83], [20, 0.83]]], number=6, tracks=[7]), second)
+        found[second] = [line.evidence.observations for line in integrator.lines.values()]
+    assert found == {"first": [7, 6], "second": [6, 7]}
+
+
+def test_a_track_that_coasts_is_hardly_evidence():
+    def confidence(score: float) -> list[float]:
+        frames = [frame_map([LINE], number=n) for n in range(2)]
+        frames += [frame_map([LINE], number=n, scores=[score]) for n in range(2, 10)]
+        return [e.confidence for e in integrate(frames)]
+
+    assert confidence(0.1) == []
+    assert confidence(0.8)[0] > confidence(0.25)[0] > 0.5
+
+
 def test_a_ring_that_crosses_itself_is_repaired():
     bow_tie = [[0, 0], [8, 4], [8, 0], [0, 3.5], [0, 0]]
     integrator = MapIntegrator()
