@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.errors import UserError
@@ -21,19 +22,53 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ImageConfig(Section):
-    """What the network sees of each camera.
+class ImageWindowConfig(Section):
+    """The rows of each image that show the road.
 
     Stored images are scaled to ``width`` and a window of ``height`` rows is cut out, so that the projected horizon
     lies at ``horizon`` of the window's height (negative: above its top row); the window stays inside the image where
     the image is tall enough.
+
+    Attributes:
+        mean, deviation: of red, green and blue in the training data, 0 to 1.
     """
 
+    kind: Literal["window"] = "window"
     width: Positive = 256
     height: Positive = 96
     horizon: float = 0.32
     mean: tuple[float, float, float] = (0.485, 0.456, 0.406)
     deviation: tuple[float, float, float] = (0.229, 0.224, 0.225)
+
+
+class WholeImageConfig(Section):
+    """Whole images, as MapTracker sees them; the defaults are those of its nuScenes weights.
+
+    Each image is stretched to ``width`` x ``height``, whatever its shape (on Argoverse 2 to 608 x 608, the upright
+    front camera as well), and zeros are added at the right and at the bottom to multiples of ``multiple``.
+
+    Attributes:
+        mean: of blue, green and red, 0 to 255: the order that the backbone takes. It is only subtracted.
+    """
+
+    kind: Literal["whole"] = "whole"
+    width: Positive = 800
+    height: Positive = 480
+    multiple: Positive = 32
+    mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
+
+
+def _image_kind(value: object) -> str:
+    """Tell the kind of image input; files that were written before there were two have none."""
+    kind = value.get("kind", "window") if isinstance(value, Mapping) else getattr(value, "kind", "")
+    return str(kind)
+
+
+ImageConfig = Annotated[
+    Annotated[ImageWindowConfig, Tag("window")] | Annotated[WholeImageConfig, Tag("whole")],
+    Discriminator(_image_kind),
+]
+"""What the network sees of each camera."""
 
 
 class BackboneConfig(Section):
@@ -178,7 +213,7 @@ class PredMapNetConfig(Section):
     name: str = "lite"
     roi_length: Metres = 60.0
     roi_width: Metres = 30.0
-    image: ImageConfig = ImageConfig()
+    image: ImageConfig = ImageWindowConfig()
     backbone: BackboneConfig = BackboneConfig()
     bev: BevConfig = BevConfig()
     temporal_bev: TemporalBevConfig = TemporalBevConfig()

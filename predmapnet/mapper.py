@@ -16,7 +16,7 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.source import Float, Frame, Image, Rig
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import normalise_images, stack_windows
+from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.interface import FrameInputs, Instances, Selection, StreamState
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import select
@@ -34,11 +34,11 @@ class CameraImages:
     """Images of one instant as the network wants them.
 
     Attributes:
-        windows: ``(N, h, w, 3) uint8``, RGB, in the order of the rig; black where there is no image.
+        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the rig; black where there is no image.
         valid: ``(N,) bool``.
     """
 
-    windows: NDArray[np.uint8]
+    windows: Window
     valid: NDArray[np.bool_]
 
 
@@ -186,8 +186,8 @@ def choose_device(name: str) -> torch.device:
 
 
 def _same_rig(first: Rig, second: Rig) -> bool:
-    def looks(rig: Rig) -> list[tuple[str, int, int]]:
-        return [(camera.name, camera.width, camera.height) for camera in rig]
+    def looks(rig: Rig) -> list[tuple[str, int, int, float]]:
+        return [(camera.name, camera.width, camera.height, camera.ground_height) for camera in rig]
 
     def close(one: Float, other: Float) -> bool:
         return np.allclose(one, other, rtol=RIG_TOLERANCE, atol=RIG_TOLERANCE)

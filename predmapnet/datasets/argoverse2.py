@@ -42,6 +42,8 @@ Integer = NDArray[np.int64]
 
 KEY_FRAME_STRIDE = 4
 """Every fourth lidar sweep of 10 Hz is a key frame (2.5 Hz), as in the official vector-map data sets."""
+GROUND_HEIGHT = -0.33
+"""z of the road under the car in the ego frame, metres: its origin is the middle of the rear axle."""
 OLD_TRAIN_LOGS = 700
 """Logs in the train folder of the whole data set."""
 
@@ -343,4 +345,5 @@ def _camera(name: str, intrinsics: dict[str, Any], mounting: dict[str, Any], fol
             [mounting[key] for key in ("tx_m", "ty_m", "tz_m")],
             f"{folder / 'egovehicle_SE3_sensor.feather'}, {name}",
         ),
+        ground_height=GROUND_HEIGHT,
     )

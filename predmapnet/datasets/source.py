@@ -30,6 +30,7 @@ class Camera:
         width, height: pixels of the images as they are stored.
         intrinsics: ``(3, 3) float64`` for images of that size.
         camera_to_ego: ``(4, 4) float64``.
+        ground_height: z of the road under the car in the ego frame, metres: zero where the ego origin lies on it.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Camera:
     height: int
     intrinsics: Float
     camera_to_ego: Float
+    ground_height: float = 0.0
 
 
 Rig = tuple[Camera, ...]

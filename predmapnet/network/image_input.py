@@ -1,6 +1,7 @@
-"""From stored photographs to the network's input: scaling, the window below the sky, and normalisation.
+"""From stored photographs to the network's input: scaling, the part that is seen, and normalisation.
 
-The mapper and the training use these same functions, so that both see the same pixels.
+The mapper and the training use these same functions, so that both see the same pixels. What happens is decided by the
+kind of the configuration: the window below the sky, or the whole image as MapTracker takes it.
 """
 
 from __future__ import annotations
@@ -11,11 +12,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from predmapnet.config import ImageConfig
-from predmapnet.datasets.source import Camera, Image, Rig
+from mapfusion.geometry import inverse_pose
+from predmapnet.config import ImageConfig, ImageWindowConfig, WholeImageConfig
+from predmapnet.datasets.source import Camera, Float, Image, Rig
+
+Window = NDArray[np.uint8] | NDArray[np.float32]
+"""Pixels 0 to 255. Windows are rounded; whole images are not, since MapTracker stretches floating-point images."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,13 @@ class ImageWindow:
 
 
 def image_window(camera: Camera, config: ImageConfig) -> ImageWindow:
+    """Tell which part of a camera's image the network sees."""
+    if isinstance(config, WholeImageConfig):
+        return ImageWindow(config.width, config.height, top=0)
+    return _window_below_sky(camera, config)
+
+
+def _window_below_sky(camera: Camera, config: ImageWindowConfig) -> ImageWindow:
     """Place the window of one camera by its projected horizon.
 
     The horizon is where a level ray through the middle of the image is seen, so a pinhole camera of any pitch and
@@ -46,70 +59,93 @@ def image_window(camera: Camera, config: ImageConfig) -> ImageWindow:
     return ImageWindow(config.width, scaled_height, max(0, min(top, scaled_height - config.height)))
 
 
-def window_intrinsics(camera: Camera, config: ImageConfig) -> NDArray[np.float64]:
-    """Return the ``(3, 3)`` intrinsics of the network's window of one camera."""
+def window_intrinsics(camera: Camera, config: ImageConfig) -> Float:
+    """Return the ``(3, 3)`` intrinsics of the part of one camera's image that the network sees."""
     window = image_window(camera, config)
     scale = np.diag([window.scaled_width / camera.width, window.scaled_height / camera.height, 1.0])
-    intrinsics: NDArray[np.float64] = scale @ camera.intrinsics
+    intrinsics: Float = scale @ camera.intrinsics
     intrinsics[1, 2] -= window.top
     return intrinsics
 
 
-def crop_image(image: Image, camera: Camera, config: ImageConfig) -> Image:
-    """Scale one stored image and cut out the network's window.
+def ego_to_image(rig: Rig, config: ImageConfig) -> Float:
+    """Return the projections ``(N, 4, 4)``: from metres of the ego frame to (u depth, v depth, depth, 1).
+
+    u and v are pixels of the network's input, the centre of the first one at (0.5, 0.5).
+    """
+    projections = np.stack([inverse_pose(camera.camera_to_ego) for camera in rig])
+    projections[:, :3] = np.stack([window_intrinsics(camera, config) for camera in rig]) @ projections[:, :3]
+    return projections
+
+
+def input_size(config: ImageConfig) -> tuple[int, int]:
+    """Return rows and columns of the network's input."""
+    if isinstance(config, WholeImageConfig):
+        return -(-config.height // config.multiple) * config.multiple, -(
+            -config.width // config.multiple
+        ) * config.multiple
+    return config.height, config.width
+
+
+def crop_image(image: Image, camera: Camera, config: ImageConfig) -> Window:
+    """Scale one stored image and cut out what the network sees.
 
     Args:
         image: ``(camera.height, camera.width, 3) uint8``, RGB.
         camera: the camera that took it.
-        config: the network's image size.
+        config: the network's image input.
 
     Returns:
-        ``(config.height, config.width, 3) uint8``; rows that the image does not have are black.
+        ``(config.height, config.width, 3)``, RGB; rows that the image does not have are black.
     """
     window = image_window(camera, config)
     size = (window.scaled_width, window.scaled_height)
+    if isinstance(config, WholeImageConfig):
+        # No averaging: released weights have learned from images as coarse as this interpolation leaves them.
+        stretched = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        return np.asarray(stretched, dtype=np.float32)
     scaled = image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     cropped = scaled[window.top : window.top + config.height]
     missing = config.height - len(cropped)
-    return np.pad(cropped, ((0, missing), (0, 0), (0, 0))) if missing else np.ascontiguousarray(cropped)
+    whole = np.pad(cropped, ((0, missing), (0, 0), (0, 0))) if missing else np.ascontiguousarray(cropped)
+    return np.asarray(whole, dtype=np.uint8)
 
 
 def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
-    """Turn ``(..., h, w, 3) uint8`` RGB windows into ``(..., 3, h, w) float32`` (channels-last in memory)."""
+    """Turn windows into the network's input.
+
+    Args:
+        images: ``(..., h, w, 3)`` RGB, 0 to 255, from :func:`crop_image`.
+        config: the network's image input.
+
+    Returns:
+        ``(..., 3, rows, columns) float32`` of :func:`input_size`, channels-last in memory. Red, green, blue for a
+        window; blue, green, red for whole images.
+    """
+    mean = torch.tensor(config.mean, device=images.device)
+    if isinstance(config, WholeImageConfig):
+        rows, columns = input_size(config)
+        centred = images.float().flip(-1) - mean
+        margin = (0, 0, 0, columns - centred.shape[-2], 0, rows - centred.shape[-3])
+        return F.pad(centred, margin).movedim(-1, -3)
     deviation = torch.tensor(config.deviation, device=images.device) * 255.0
-    mean = torch.tensor(config.mean, device=images.device) * 255.0
-    return ((images.float() - mean) / deviation).movedim(-1, -3)
+    return ((images.float() - mean * 255.0) / deviation).movedim(-1, -3)
 
 
-def stack_windows(
-    images: Mapping[str, Image], rig: Rig, config: ImageConfig
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Window, NDArray[np.bool_]]:
     """Cut the windows of one instant.
 
     Args:
         images: RGB uint8 images at their stored size, by camera name; cameras may be missing.
         rig: all cameras of the car.
-        config: the network's image size.
+        config: the network's image input.
 
     Returns:
-        ``(N, h, w, 3) uint8`` windows, black where there is no image, and ``(N,) bool``, which cameras have one.
+        ``(N, h, w, 3)`` windows, black where there is no image, and ``(N,) bool``, which cameras have one.
     """
-    blank = np.zeros((config.height, config.width, 3), dtype=np.uint8)
+    blank = np.zeros((config.height, config.width, 3), np.float32 if config.kind == "whole" else np.uint8)
     windows = [crop_image(images[camera.name], camera, config) if camera.name in images else blank for camera in rig]
     return np.stack(windows), np.array([camera.name in images for camera in rig])
-
-
-def preprocess_images(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Tensor, Tensor]:
-    """Prepare the images of one instant for the network.
-
-    Args:
-        images, rig, config: as for :func:`stack_windows`.
-
-    Returns:
-        ``(N, 3, h, w) float32`` images and ``(N,) bool``, which of them are there.
-    """
-    windows, valid = stack_windows(images, rig, config)
-    return normalise_images(torch.from_numpy(windows), config), torch.from_numpy(valid)
 
 
 def mirror_rig(rig: Rig) -> Rig:

@@ -14,7 +14,7 @@ from torch import Tensor
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.source import Camera, Float, Rig
 from predmapnet.network.image_backbone import STRIDE
-from predmapnet.network.image_input import window_intrinsics
+from predmapnet.network.image_input import input_size, window_intrinsics
 from predmapnet.network.layers import cell_centres
 
 Integer = NDArray[np.int64]
@@ -76,14 +76,14 @@ class RigLookup:
 
 
 def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
-    """Project the centres of all ground cells (z = 0 of the ego frame) into all cameras.
+    """Project the centres of all ground cells (at the height of the road under the car) into all cameras.
 
     Args:
         rig: cameras at the size of their stored images; scaling and the window are taken care of here.
         config: image and grid sizes.
     """
     grid = (2 * config.bev.rows, 2 * config.bev.columns)
-    rows, columns = -(-config.image.height // STRIDE), -(-config.image.width // STRIDE)
+    rows, columns = (-(-size // STRIDE) for size in input_size(config.image))
     roi = config.roi
     ground = (cell_centres(*grid).double().numpy().reshape(-1, 2) - 0.5) * roi.size
     entries: list[tuple[Integer, Integer, Float]] = []
@@ -108,7 +108,7 @@ def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
 def _project(ground: Float, camera: Camera, config: PredMapNetConfig) -> tuple[Float, NDArray[np.bool_]]:
     """Return pixels ``(n, 2)`` in the network's window, and whether each point is inside it."""
     rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
-    points = (np.column_stack([ground, np.zeros(len(ground))]) - position) @ rotation
+    points = (np.column_stack([ground, np.full(len(ground), camera.ground_height)]) - position) @ rotation
     depth = points[:, 2]
     projected = points @ window_intrinsics(camera, config.image).T
     pixels = projected[:, :2] / np.maximum(depth, 1e-3)[:, None]

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import ImageWindowConfig, PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.source import Camera, Scene
 from predmapnet.errors import UserError
@@ -41,7 +41,8 @@ def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
 
         dataset = f"{DEMO}-v{WORLD_VERSION}"
     shape = f"{config.image.width}x{config.image.height}"
-    key = f"{config.image.horizon} {config.roi_length} {config.roi_width}".encode()
+    seen = config.image.horizon if isinstance(config.image, ImageWindowConfig) else config.image.kind
+    key = f"{seen} {config.roi_length} {config.roi_width}".encode()
     return root / f"{dataset}-{shape}-{sha256(key).hexdigest()[:8]}"
 
 
@@ -148,7 +149,7 @@ def cache_scene(folder: Path, scene: Scene, config: PredMapNetConfig) -> None:
         if any(camera.name not in frame.images for camera in frame.rig):
             continue
         pictures = [crop_image(read_image(frame.images[c.name]), c, config.image) for c in frame.rig]
-        images.append(np.stack(pictures))
+        images.append(np.rint(pictures).astype(np.uint8))
         poses.append(frame.ego_to_global)
         truths.append(truth)
     if not images:
