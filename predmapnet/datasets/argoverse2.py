@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.argoverse2_files import (
-    CAMERAS,
     POSES,
     city,
     every_sweep,
@@ -28,6 +27,7 @@ from predmapnet.datasets.argoverse2_frames import (
     strided_over_time,
     sweeps_with_images,
 )
+from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
@@ -160,7 +160,7 @@ class Argoverse2Source:
         cameras = self._logs[log] / "sensors" / "cameras"
         if not cameras.is_dir():
             raise UserError(f"{self._logs[log]} has no images, but the official frames are those with all images.")
-        return [timed_files(cameras / name, ".jpg")[0] for name in CAMERAS]
+        return [timed_files(cameras / name, ".jpg")[0] for name in ARGOVERSE2_CAMERAS]
 
     def _info(self, log: str) -> SceneInfo:
         folder = self._logs[log]
@@ -244,10 +244,10 @@ class Argoverse2Scene:
             )
         intrinsics = rows_by_sensor(calibration / "intrinsics.feather")
         mounting = rows_by_sensor(calibration / "egovehicle_SE3_sensor.feather")
-        missing = [name for name in CAMERAS if name not in intrinsics or name not in mounting]
+        missing = [name for name in ARGOVERSE2_CAMERAS if name not in intrinsics or name not in mounting]
         if missing:
             raise UserError(f"{calibration} does not describe the cameras {', '.join(missing)}.")
-        return tuple(_camera(name, intrinsics[name], mounting[name], calibration) for name in CAMERAS)
+        return tuple(_camera(name, intrinsics[name], mounting[name], calibration) for name in ARGOVERSE2_CAMERAS)
 
     @cached_property
     def _images(self) -> dict[str, tuple[Integer, list[Path]]]:
@@ -258,7 +258,7 @@ class Argoverse2Scene:
                 f"{self._folder} has no images (looked for sensors/cameras/ring_*/<timestamp>.jpg): it can serve "
                 "ground truth, but it cannot be mapped. Fetch the log's camera images."
             )
-        return {name: timed_files(folder / name, ".jpg") for name in CAMERAS}
+        return {name: timed_files(folder / name, ".jpg") for name in ARGOVERSE2_CAMERAS}
 
     def frame(self, index: int) -> Frame:
         """Return frame ``index``: pose at exactly the sweep's time stamp, nearest image of each camera within 25 ms.
@@ -268,7 +268,7 @@ class Argoverse2Scene:
             UserError: no calibration, no images, or a pose is missing or broken.
         """
         instant = self.instant(index)
-        images = {name: _nearest(*self._images[name], instant.timestamp) for name in CAMERAS}
+        images = {name: _nearest(*self._images[name], instant.timestamp) for name in ARGOVERSE2_CAMERAS}
         return Frame(
             scene=self.info.name,
             index=index,

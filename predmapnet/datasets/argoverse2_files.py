@@ -11,20 +11,12 @@ import orjson
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, feather
 
+from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.splits import SPLITS
 from predmapnet.errors import UserError
 
 Integer = NDArray[np.int64]
 
-CAMERAS = (
-    "ring_front_center",
-    "ring_front_right",
-    "ring_front_left",
-    "ring_rear_right",
-    "ring_rear_left",
-    "ring_side_right",
-    "ring_side_left",
-)
 POSES = "city_SE3_egovehicle.feather"
 SWEEP_LIST = "lidar_timestamps_ns.json"
 
@@ -45,7 +37,7 @@ def every_sweep(folder: Path) -> Integer:
     if len(sweeps):
         return sweeps
     # The front camera runs at twice the lidar's rate.
-    images, _ = timed_files(folder / "sensors" / "cameras" / CAMERAS[0], ".jpg")
+    images, _ = timed_files(folder / "sensors" / "cameras" / ARGOVERSE2_CAMERAS[0], ".jpg")
     return images[::2]
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
+from predmapnet.datasets.cameras import NUSCENES_CAMERAS
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map
@@ -26,7 +27,6 @@ from predmapnet.errors import UserError
 
 Float = NDArray[np.float64]
 
-CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 OLD_SPLIT = {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"}
 OLD_MINI_SPLIT = {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"}
 NEW_SPLIT = {"train": "nuscenes_new_train", "val": "nuscenes_new_val"}
@@ -252,7 +252,7 @@ class NuScenesScene:
         """First record of each camera, in rig order: stands in for the calibration where a frame lacks an image."""
         return {
             channel: next(frame.sensors[channel] for frame in self._frames if channel in frame.sensors)
-            for channel in CAMERAS
+            for channel in NUSCENES_CAMERAS
             if any(channel in frame.sensors for frame in self._frames)
         }
 
@@ -302,7 +302,9 @@ class NuScenesScene:
         ego_to_shifted = inverse_pose(instant.ego_to_global) @ self._poses(index)[0]
         frame = self._frames[index]
         images = {
-            channel: self._root / frame.sensors[channel]["filename"] for channel in CAMERAS if channel in frame.sensors
+            channel: self._root / frame.sensors[channel]["filename"]
+            for channel in NUSCENES_CAMERAS
+            if channel in frame.sensors
         }
         return Frame(
             scene=self.info.name,
