@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 from mapfusion.geometry import inverse_pose
 from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageConfig
 from predmapnet.datasets.argoverse2 import GROUND_HEIGHT, Argoverse2Source
+from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.datasets.source import Camera
 from predmapnet.demo_world.rig import DEMO_RIG
@@ -149,6 +151,21 @@ def test_projections_of_the_real_car_are_the_official_ones():
     expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), config)
     assert torch.equal(hits, expected_hits)
     torch.testing.assert_close(positions[hits], expected[hits], rtol=0, atol=1e-6)
+
+
+@pytest.mark.reference
+def test_real_photographs_arrive_as_the_official_chain_prepares_them():
+    source = NuScenesSource(fixture("nuscenes_sample"))
+    frame = source.open(source.scenes()[0].name).frame(0)
+    images = {name: read_image(path) for name, path in frame.images.items()}
+    windows, valid = stack_windows(images, frame.rig, WHOLE)
+    prepared = normalise_images(torch.from_numpy(windows), WHOLE)
+    assert valid.all() and prepared.shape == (6, 3, 480, 800)
+    for one, ours in zip(frame.rig, prepared, strict=True):
+        # Read as blue, green, red; stretched as floating-point numbers; the mean taken off last.
+        official = cv2.imread(str(frame.images[one.name]), cv2.IMREAD_COLOR).astype(np.float32)
+        official = stretched(official, 480, 800) - [103.530, 116.280, 123.675]
+        np.testing.assert_allclose(ours.permute(1, 2, 0), official, atol=2e-3)
 
 
 def test_a_rig_whose_origin_lies_above_the_road_sees_the_same_road():
