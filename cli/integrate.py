@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,7 +22,10 @@ def integrate(
         Path | None, typer.Option(help="Poses by token (.json or .csv), for .json results.", show_default=False)
     ] = None,
     location: Annotated[
-        str | None, typer.Option(help="Where the poses' frame lies: a nuScenes map or Argoverse 2 city (PIT).")
+        str | None,
+        typer.Option(
+            help="Where the poses' frame lies, if the frames do not say it: a nuScenes map or Argoverse 2 city (PIT)."
+        ),
     ] = None,
     origin: Annotated[
         str | None, typer.Option(help="Or latitude,longitude of its origin, x pointing east: 49.01,8.41.")
@@ -38,6 +41,7 @@ def integrate(
     """Fuse what any detector saw, frame by frame, into one map."""
     from cli.console import out as screen
     from cli.console import say_warning
+    from mapfusion.coverage import observed_rings
     from mapfusion.elements import ElementKind
     from mapfusion.io import write_map
     from predmapnet import __version__
@@ -50,13 +54,17 @@ def integrate(
     if location is not None or origin is not None:
         _georeference(location, origin)  # a mistake there is told before the work begins
     done = integrate_file(frames, poses, region, min_score, y_forward)
-    georeference = _georeference(location or (None if origin else done.location), origin)
-    provenance = {
+    synthetic = done.synthetic and location is None
+    georeference = _georeference(location or (None if origin else done.location), origin, synthetic)
+    provenance: dict[str, Any] = {
         "generator": "predmapnet integrate",
         "version": __version__,
         "frames_file": frames.name,
         "logs": list(done.logs),
+        "observed": observed_rings(done.observed, georeference),
     }
+    if done.synthetic:
+        provenance["synthetic"] = True
     try:
         write_map(done.map, out, georeference, provenance)
     except ValueError as error:
@@ -83,14 +91,9 @@ def _region(text: str) -> RegionOfInterest:
     return RegionOfInterest(length, width)
 
 
-def _georeference(location: str | None, origin: str | None) -> Georeference:
+def _georeference(location: str | None, origin: str | None, synthetic: bool = False) -> Georeference:
     from mapfusion.export.plane import LocalPlane
-    from predmapnet.datasets.georeference import (
-        ARGOVERSE2_CITIES,
-        NUSCENES_ORIGINS,
-        argoverse2_georeference,
-        nuscenes_georeference,
-    )
+    from predmapnet.datasets.georeference import ARGOVERSE2_CITIES, NUSCENES_ORIGINS, georeference_of
     from predmapnet.errors import UserError
 
     if origin is not None:
@@ -103,7 +106,7 @@ def _georeference(location: str | None, origin: str | None) -> Georeference:
         if not (abs(latitude) < 85 and abs(longitude) <= 180):
             raise UserError(f"--origin {origin} does not lie on Earth; latitude comes first")
         return LocalPlane(longitude, latitude, "given origin")
-    found = nuscenes_georeference(location or "") or argoverse2_georeference(location or "")
+    found = georeference_of(location or "", synthetic)
     if found is None:
         known = ", ".join([*NUSCENES_ORIGINS, *ARGOVERSE2_CITIES])
         where = f"the location '{location}' is not known" if location else "nobody knows where on Earth the poses lie"

@@ -60,7 +60,7 @@ def ground_within(rings: Sequence[Float]) -> shapely.Geometry:
 
 def rings_around(ground: shapely.Geometry, smallest_hole: float = 0.0) -> list[Float]:
     """Return the rings ``(n, 2)`` of ground, those of holes of at least some area (square of its unit) among them."""
-    parts = [part for part in shapely.get_parts(ground) if part.geom_type == "Polygon"]
+    parts = [part for part in shapely.get_parts(ground) if part.geom_type == "Polygon" and not part.is_empty]
     holes = [hole for part in parts for hole in part.interiors if shapely.Polygon(hole).area >= smallest_hole]
     return [shapely.get_coordinates(ring) for ring in (*(part.exterior for part in parts), *holes)]
 

@@ -68,6 +68,9 @@ class FrameMap:
         segmentation: ``(3, rows, columns) float32`` probabilities per kind over the ROI; row 0 is the largest
             y, column 0 the smallest x. ``None`` if the mapper makes none.
         history_masks: ``(n, rows, columns) float32``, raster memory of each element, same grid convention.
+        visible: rings ``(k, 2) float64``, metres, ego frame, around the ground that could be seen at that instant; a
+            ring within another is a hole. Nothing seen where nothing can be seen is no evidence (see
+            :func:`mapfusion.visibility.visible_ground`). ``None``: all of the ROI.
     """
 
     timestamp: int
@@ -80,6 +83,7 @@ class FrameMap:
     forecasts: tuple[Float, ...] | None = None
     segmentation: NDArray[np.float32] | None = None
     history_masks: NDArray[np.float32] | None = None
+    visible: tuple[Float, ...] | None = None
 
     def __post_init__(self) -> None:
         lengths = {len(self.kinds), len(self.scores), len(self.track_ids), len(self.polylines)}

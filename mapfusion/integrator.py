@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from mapfusion.association import Candidate, assign, candidates, gather
@@ -30,7 +31,8 @@ from mapfusion.rings import (
 )
 from mapfusion.spatial import TileIndex
 from mapfusion.state import load_state, save_state
-from mapfusion.views import ViewGrid
+from mapfusion.views import ViewGrid, clearly_visible
+from mapfusion.visibility import ground_problem
 
 Float = NDArray[np.float64]
 
@@ -75,15 +77,18 @@ class MapIntegrator:
             log: name of the drive; poses are checked against other frames of the same drive only, and equal track
                 ids of two drives are two tracks.
         """
-        problem = pose_problem(frame_map.ego_to_global) or self.journal.enter(
-            log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed
+        problem = (
+            pose_problem(frame_map.ego_to_global)
+            or ground_problem(frame_map)
+            or self.journal.enter(log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed)
         )
         if problem is not None:
             self.rejections[problem] += 1
             return
-        lines, rings = observe(frame_map, self.config, self.rejections, log)
+        visible = clearly_visible(frame_map)
+        lines, rings = observe(frame_map, self.config, self.rejections, log, visible)
         self.frames += 1
-        self.views.add(frame_map.ego_to_global, frame_map.roi)
+        self.views.add(frame_map.ego_to_global, frame_map.roi, visible)
         reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + 2.0
         low, high = frame_map.ego_to_global[:2, 3] - reach, frame_map.ego_to_global[:2, 3] + reach
         near = self.index.near(low, high)
@@ -91,7 +96,7 @@ class MapIntegrator:
         for kind in (ElementKind.DIVIDER, ElementKind.BOUNDARY):
             known = {i: self.lines[i] for i in near if i in self.lines and self.lines[i].kind is kind}
             self._add_lines([o for o in lines if o.kind is kind], known, low, high, frame_map.timestamp)
-        self._add_rings(rings, [i for i in near if i in self.rings], frame_map)
+        self._add_rings(rings, [i for i in near if i in self.rings], frame_map, visible)
 
     def map(self) -> GlobalMap:
         """Return the map as it stands; only what changed since the last call is computed."""
@@ -225,7 +230,9 @@ class MapIntegrator:
                 self.put_line(self.next_id, FusedLine(other.kind, piece, evidence))
                 self.next_id += 1
 
-    def _add_rings(self, observations: list[Observation], near: list[int], frame_map: FrameMap) -> None:
+    def _add_rings(
+        self, observations: list[Observation], near: list[int], frame_map: FrameMap, visible: shapely.Geometry | None
+    ) -> None:
         cell = self.config.ring_cell
         rooms = [room_of(observation.points, cell) for observation in observations]
         sightings: list[RingSighting] = []
@@ -234,7 +241,8 @@ class MapIntegrator:
             around = [i for i in near if (self.rings[i].corner < high).all() and (self.rings[i].stop > low).all()]
             wide_low = np.min([low, *(self.rings[i].corner for i in around)], axis=0)
             wide_high = np.max([high, *(self.rings[i].stop for i in around)], axis=0)
-            sighting = sight(observation, (wide_low, wide_high), frame_map.ego_to_global, frame_map.roi, cell)
+            room = wide_low, wide_high
+            sighting = sight(observation, room, frame_map.ego_to_global, frame_map.roi, cell, visible)
             shares = {i: overlap(self.rings[i], sighting) for i in around}
             sightings.append(sighting)
             options.append(

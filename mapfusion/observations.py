@@ -72,7 +72,11 @@ def pose_problem(ego_to_global: Float) -> str | None:
 
 
 def observe(
-    frame_map: FrameMap, config: IntegratorConfig, rejections: Counter[str], log: str = ""
+    frame_map: FrameMap,
+    config: IntegratorConfig,
+    rejections: Counter[str],
+    log: str = "",
+    visible: shapely.Geometry | None = None,
 ) -> tuple[list[Observation], list[Observation]]:
     """Return the lines and the rings of a frame that can be fused.
 
@@ -81,6 +85,7 @@ def observe(
         config: spacing and error model.
         rejections: counted up by reason for every element that is left out.
         log: name of the drive.
+        visible: what could be seen, ego frame; None for all of the ROI.
 
     Returns:
         Lines (clipped to the ROI, resampled) and rings.
@@ -105,12 +110,17 @@ def observe(
                 continue
             rows.append(row)
             curves.append(curve)
-    observations = _observations(frame_map, rows, curves, config, log)
+    observations = _observations(frame_map, rows, curves, config, log, visible)
     return [o for o in observations if not o.kind.is_ring], [o for o in observations if o.kind.is_ring]
 
 
 def _observations(
-    frame_map: FrameMap, rows: list[int], curves: list[Float], config: IntegratorConfig, log: str
+    frame_map: FrameMap,
+    rows: list[int],
+    curves: list[Float],
+    config: IntegratorConfig,
+    log: str,
+    visible: shapely.Geometry | None,
 ) -> list[Observation]:
     """Say where the points of curves of the ego frame lie and what they are worth, all at once."""
     if not rows:
@@ -119,18 +129,22 @@ def _observations(
     ends = np.cumsum([len(curve) for curve in curves])
     deviation = config.deviation_near + config.deviation_per_metre * np.sqrt((local**2).sum(axis=1))
     points = transform_points(frame_map.ego_to_global, local)
-    view = view_weight(local, frame_map.roi, config)
+    view = whole = view_weight(local, frame_map.roi, config)
+    if visible is not None:
+        view = view_weight(local, frame_map.roi, config, visible)
     observations = []
     for row, start, stop in zip(rows, [0, *ends[:-1].tolist()], ends.tolist(), strict=True):
         score = float(frame_map.scores[row])
+        kind = ElementKind(int(frame_map.kinds[row]))
+        looked = whole if kind.is_ring else view  # what of a ring could not be seen is known by its cells
         observations.append(
             Observation(
-                kind=ElementKind(int(frame_map.kinds[row])),
+                kind=kind,
                 track=(log, int(frame_map.track_ids[row])),
                 score=score,
                 points=points[start:stop],
                 information=max(score, 0.05) / deviation[start:stop] ** 2,
-                view=view[start:stop] * min(score / SURE_SCORE, 1.0),
+                view=looked[start:stop] * min(score / SURE_SCORE, 1.0),
             )
         )
     return observations

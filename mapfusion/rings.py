@@ -101,12 +101,14 @@ class RingSighting:
         corner: ``(2,) int64``, lattice index of the first cell.
         distance: ``(rows, columns) float32``, signed distance, metres, positive inside, truncated.
         visible: ``(rows, columns) bool``, cells inside the ROI and clear of its rim.
+        clear: ``(rows, columns) bool``, those of them that nothing hid.
     """
 
     observation: Observation
     corner: Integer
     distance: Grid
     visible: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
 
     @property
     def stop(self) -> Integer:
@@ -116,7 +118,8 @@ class RingSighting:
     def crop(self, corner: Integer, stop: Integer) -> RingSighting:
         """Return the part that holds cells ``corner`` to ``stop``."""
         (a, b), (c, d) = (corner - self.corner).tolist(), (stop - self.corner).tolist()
-        return RingSighting(self.observation, corner, self.distance[a:c, b:d], self.visible[a:c, b:d])
+        part = slice(a, c), slice(b, d)
+        return RingSighting(self.observation, corner, self.distance[part], self.visible[part], self.clear[part])
 
 
 def room_of(points: Float, cell: float) -> tuple[Integer, Integer]:
@@ -132,6 +135,7 @@ def sight(
     pose: Float,
     roi: RegionOfInterest,
     cell: float,
+    visible_ground: shapely.Geometry | None = None,
 ) -> RingSighting:
     """Put an observed ring on the lattice.
 
@@ -141,22 +145,24 @@ def sight(
         pose: ``ego_to_global`` of the frame.
         roi: what was looked at.
         cell: lattice constant, metres.
+        visible_ground: what could be seen, ego frame; None for all of the ROI.
     """
     low, high = room
     own_low, own_high = room_of(observation.points, cell)
     global_to_ego = inverse_pose(pose)
     x, y = ((np.arange(low[axis], high[axis]) + 0.5) * cell for axis in range(2))
     axes, origin = global_to_ego[:2, :2], global_to_ego[:2, 3]
-    forward = np.abs(x[:, None] * axes[0, 0] + y[None, :] * axes[0, 1] + origin[0])
-    left = np.abs(x[:, None] * axes[1, 0] + y[None, :] * axes[1, 1] + origin[1])
-    visible = (forward < roi.length / 2 - CUT_RIM) & (left < roi.width / 2 - CUT_RIM)
+    forward = x[:, None] * axes[0, 0] + y[None, :] * axes[0, 1] + origin[0]
+    left = x[:, None] * axes[1, 0] + y[None, :] * axes[1, 1] + origin[1]
+    visible = (np.abs(forward) < roi.length / 2 - CUT_RIM) & (np.abs(left) < roi.width / 2 - CUT_RIM)
+    clear = visible if visible_ground is None else visible & shapely.contains_xy(visible_ground, forward, left)
     distance = np.full(visible.shape, -TRUNCATION, dtype=np.float32)
     (a, b), (c, d) = (own_low - low).tolist(), (own_high - low).tolist()
     rim = roi.size / 2 - CUT_RIM
     local = transform_points(global_to_ego, observation.points) / rim
     cut = ((local[:-1] > 1) & (local[1:] > 1)) | ((local[:-1] < -1) & (local[1:] < -1))
     distance[a:c, b:d] = _signed_distance(x[a:c], y[b:d], observation.points, np.asarray(~cut.any(axis=1)))
-    return RingSighting(observation, low, distance, visible)
+    return RingSighting(observation, low, distance, visible, clear)
 
 
 def _signed_distance(x: Float, y: Float, ring: Float, counts: NDArray[np.bool_]) -> Grid:
@@ -207,7 +213,7 @@ def fuse_ring(ring: FusedRing, sighting: RingSighting, timestamp: int) -> None:
     information = sighting.visible * np.float32(observation.information.mean())
     ring.distance[window] += information * sighting.distance
     ring.looked[window] += information
-    ring.seen_view[window] += sighting.visible * np.float32(observation.view.mean())
+    ring.seen_view[window] += sighting.clear * np.float32(observation.view.mean())
     ring.seen += observation.sighting
     ring.evidence.sighted(observation.track, timestamp)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from mapfusion.config import IntegratorConfig
-from mapfusion.elements import RegionOfInterest
+from mapfusion.coverage import ground_within
+from mapfusion.elements import FrameMap, RegionOfInterest
 
 Float = NDArray[np.float64]
 Tile: TypeAlias = tuple[int, int]
@@ -17,19 +19,37 @@ TILE_CELLS = 64
 """Cells of one metre along each side of a tile."""
 
 
-def view_weight(points_ego: Float, roi: RegionOfInterest, config: IntegratorConfig) -> Float:
+SHADOW_RIM = 0.5
+"""This close to ground that nobody could see, nothing found means nothing, metres."""
+
+
+def clearly_visible(frame_map: FrameMap) -> shapely.Geometry | None:
+    """Return the ground of a frame that could be seen, clear of its rim, ego frame; None where all of the ROI could."""
+    if frame_map.visible is None:
+        return None
+    ground = shapely.buffer(ground_within(frame_map.visible), -SHADOW_RIM, quad_segs=1)
+    shapely.prepare(ground)
+    return ground
+
+
+def view_weight(
+    points_ego: Float, roi: RegionOfInterest, config: IntegratorConfig, visible: shapely.Geometry | None = None
+) -> Float:
     """How much a missing detection at each point says.
 
     Args:
-        points_ego: ``(n, 2)``, metres, ego frame.
+        points_ego: ``(..., 2)``, metres, ego frame.
         roi: the region that was looked at.
         config: rim and ranges.
+        visible: what of it could be seen, ego frame; None for all.
 
     Returns:
-        ``(n,) float64`` in ``[0, 1]``; 0 outside the ROI and at its rim.
+        ``(...) float64`` in ``[0, 1]``; 0 outside the ROI, at its rim, and where nothing could be seen.
     """
     x, y = points_ego[..., 0], points_ego[..., 1]
     inside = (np.abs(x) < roi.length / 2 - config.rim) & (np.abs(y) < roi.width / 2 - config.rim)
+    if visible is not None:
+        inside = inside & shapely.contains_xy(visible, x, y)
     far = (np.hypot(x, y) - config.view_full) / (config.view_far - config.view_full)
     weight = 1.0 - (1.0 - config.view_floor) * np.clip(far, 0.0, 1.0)
     return np.where(inside, weight, 0.0)
@@ -44,12 +64,13 @@ class ViewGrid:
         self.config = config
         self.tiles: dict[Tile, NDArray[np.float32]] = {}
 
-    def add(self, ego_to_global: Float, roi: RegionOfInterest) -> None:
+    def add(self, ego_to_global: Float, roi: RegionOfInterest, visible: shapely.Geometry | None = None) -> None:
         """Count one frame.
 
         Args:
             ego_to_global: ``(4, 4)``.
             roi: the region that was looked at.
+            visible: what of it could be seen, ego frame; None for all.
         """
         rotation, origin = ego_to_global[:2, :2], ego_to_global[:2, 3]
         reach = np.abs(rotation) @ (roi.size / 2)
@@ -64,7 +85,7 @@ class ViewGrid:
             ],
             axis=-1,
         )
-        weight = view_weight(centres, roi, self.config)
+        weight = view_weight(centres, roi, self.config, visible)
         for row in range(low[0] // TILE_CELLS, (high[0] - 1) // TILE_CELLS + 1):
             for column in range(low[1] // TILE_CELLS, (high[1] - 1) // TILE_CELLS + 1):
                 corner = np.array([row, column]) * TILE_CELLS

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import orjson
+import shapely
 from numpy.typing import NDArray
 
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
+from mapfusion.visibility import frame_ground
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames_io import read_frames, refuse_pickle
 from predmapnet.evaluation.submission import NOTHING, SubmittedFrame, position_name, read_submission
@@ -41,15 +43,19 @@ class Integration:
         logs: names of the drives.
         rejections: what the integrator left out, by reason.
         notes: what the user should know.
+        observed: ground that the frames looked at, metres.
         location: of the data set, if the frames say it.
+        synthetic: whether the frames say that the place is made up.
     """
 
     map: GlobalMap
     frames: int
     logs: tuple[str, ...]
     rejections: Mapping[str, int]
+    observed: shapely.Geometry
     notes: tuple[str, ...] = ()
     location: str = ""
+    synthetic: bool = False
 
 
 def integrate_file(
@@ -72,13 +78,13 @@ def integrate_file(
         UserError: a file that cannot be read, tokens without poses, points that cannot be metres of the ego frame.
     """
     notes: list[str] = []
-    location = ""
+    provenance: Mapping[str, Any] = {}
     if frames.suffix.lower() == ".parquet":
         if poses is not None:
             raise UserError(f"{frames} holds its poses itself; leave out --poses.")
         stored = read_frames(frames)
         logged = [LoggedFrame(frame.scene, frame.frame_map) for frame in stored.frames]
-        location = str(stored.provenance.get("location", ""))
+        provenance = stored.provenance
     else:
         if poses is None:
             raise UserError(f"{frames} holds no poses: give them with --poses poses.json or --poses poses.csv.")
@@ -87,7 +93,8 @@ def integrate_file(
         if y_forward:
             submitted = {token: _turned(frame) for token, frame in submitted.items()}
         logged = _placed(frames, poses, submitted, known, roi or RegionOfInterest(), min_score, notes)
-    return replace(integrate(logged), notes=tuple(notes), location=location)
+    location, synthetic = str(provenance.get("location", "")), bool(provenance.get("synthetic"))
+    return replace(integrate(logged), notes=tuple(notes), location=location, synthetic=synthetic)
 
 
 def integrate(frames: Iterable[LoggedFrame]) -> Integration:
@@ -100,10 +107,14 @@ def integrate(frames: Iterable[LoggedFrame]) -> Integration:
     if not ordered:
         raise UserError("there is no frame to integrate")
     integrator = MapIntegrator()
+    grounds = []
     for frame in ordered:
+        before = integrator.frames
         integrator.add(frame.frame_map, frame.log)
+        if integrator.frames > before:
+            grounds.append(frame_ground(frame.frame_map))
     logs = tuple(dict.fromkeys(frame.log for frame in ordered))
-    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections))
+    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), shapely.union_all(grounds))
 
 
 def _read_json(path: Path) -> dict[str, SubmittedFrame]:

@@ -12,6 +12,7 @@ from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
 from mapfusion.integrator import MapIntegrator
 from predmapnet.datasets.source import Frame, Scene
 from predmapnet.errors import UserError
+from predmapnet.field_of_view import seen_in
 from predmapnet.mapper import CameraImages, Mapper
 
 MapSnapshot = Callable[[], GlobalMap]
@@ -129,6 +130,7 @@ def stream(
             if index + 1 < len(scene):
                 upcoming = reader.submit(read, index + 1)
             frame_map, state = mapper.step(frame, state, images=images)
+            frame_map = replace(frame_map, visible=seen_in(frame, mapper.roi))
             mapped = perf_counter()
             integrator.add(frame_map, log=frame.scene)
             done = perf_counter()

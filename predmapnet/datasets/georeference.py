@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -107,3 +108,19 @@ def demo_georeference(name: str, index: int) -> SphereGeoreference:
     """
     row, column = divmod(index, 20)
     return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)
+
+
+def georeference_of(location: str, synthetic: bool = False) -> SphereGeoreference | UtmGeoreference | None:
+    """Return where the frame of a location lies: a nuScenes map, an Argoverse 2 city or a town of the demo world.
+
+    Args:
+        location: as frames' files and maps name it: ``boston-seaport``, ``PIT``, ``town-0101``.
+        synthetic: whether the place is made up; a made-up one never lies where a real one does.
+
+    Returns:
+        The georeference, or None for a location that nobody knows.
+    """
+    town = re.fullmatch(r"town-(\d{4})", location)
+    if town is not None:
+        return demo_georeference(f"demo world, {location}", int(town[1]))
+    return None if synthetic else nuscenes_georeference(location) or argoverse2_georeference(location)

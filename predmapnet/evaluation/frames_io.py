@@ -16,9 +16,10 @@ scores             list of double         in [0, 1]
 track_ids          list of int64          -1 for an element that is not tracked
 polylines          list of list of double x0, y0, x1, y1, ... metres, ego frame
 forecasts          list of list of double the same for the next instant; null without a forecaster
+visible            list of list of double rings around the ground that could be seen, like polylines; null for all
 =================  =====================  =================================================================
 
-Rasters (segmentation, history masks) are not stored.
+Files without the column ``visible`` are read, too. Rasters (segmentation, history masks) are not stored.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ _SCHEMA = pa.schema(
         ("track_ids", pa.list_(pa.int64())),
         ("polylines", _LINES),
         ("forecasts", _LINES),
+        ("visible", _LINES),
     ]
 )
 
@@ -129,7 +131,7 @@ class FrameWriter:
 
     def write(self, scene: str, index: int, frame_map: FrameMap, token: str = "") -> None:
         """Append one frame."""
-        forecasts = frame_map.forecasts
+        forecasts, visible = frame_map.forecasts, frame_map.visible
         self._rows.append(
             {
                 "scene": scene,
@@ -144,6 +146,7 @@ class FrameWriter:
                 "track_ids": frame_map.track_ids.tolist(),
                 "polylines": [points.ravel().tolist() for points in frame_map.polylines],
                 "forecasts": None if forecasts is None else [points.ravel().tolist() for points in forecasts],
+                "visible": None if visible is None else [points.ravel().tolist() for points in visible],
             }
         )
         if len(self._rows) >= _ROWS_PER_GROUP:
@@ -225,7 +228,7 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
             f"{path} is no per-frame result that this program reads: it has {found} in its metadata, "
             f"version {SCHEMA_VERSION} is expected. Write it with 'predmapnet infer --save-frames'."
         )
-    missing = sorted(set(_SCHEMA.names) - set(schema.names))
+    missing = sorted(set(_SCHEMA.names) - {"visible"} - set(schema.names))
     if missing:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}; write it again with --save-frames.")
 
@@ -235,7 +238,7 @@ def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:
     pose = np.array(row["ego_to_global"], dtype=np.float64)
     if pose.shape != (16,):
         raise UserError(f"{where}: the pose has {pose.size} numbers instead of 16.")
-    forecasts = row["forecasts"]
+    forecasts, visible = row["forecasts"], row.get("visible")
     try:
         frame_map = FrameMap(
             timestamp=row["timestamp"],
@@ -246,6 +249,7 @@ def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:
             track_ids=np.array(row["track_ids"], dtype=np.int64),
             polylines=tuple(_points(line) for line in row["polylines"]),
             forecasts=None if forecasts is None else tuple(_points(line) for line in forecasts),
+            visible=None if visible is None else tuple(_points(line) for line in visible),
         )
     except ValueError as error:
         raise UserError(f"{where}: {error}.") from error

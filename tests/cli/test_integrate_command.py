@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion import ElementKind
+from mapfusion.coverage import coverage
 from mapfusion.export.plane import LocalPlane
 from mapfusion.io import read_map
 from predmapnet.evaluation.frames_io import FrameWriter
@@ -165,3 +166,27 @@ def test_points_that_are_not_finite_are_counted(predmapnet, tmp_path, drive):
     result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "-o", "map.geojson")
     assert result.code == 0, result.err
     assert "1 x points not finite" in result.err
+
+
+def test_frames_of_a_demo_town_know_their_place_and_what_was_observed(predmapnet, tmp_path, drive):
+    told = {"location": "town-0007", "synthetic": True}
+    with FrameWriter(tmp_path / "frames.parquet", told) as writer:
+        for i, frame in enumerate(drive.frames):
+            writer.write("scene-0007", i, frame)
+    result = predmapnet("integrate", "frames.parquet", "--out", "map.geojson")
+    assert result.code == 0, result.err
+    found = json.loads((tmp_path / "map.geojson").read_text())
+    longitude, latitude = np.array(found["features"][0]["geometry"]["coordinates"]).reshape(-1, 2)[0]
+    assert (longitude, latitude) == pytest.approx((-123.39 + 0.7, -48.88), abs=0.1)
+    plane = LocalPlane(float(longitude), float(latitude))
+    half = predmapnet("integrate", "frames.parquet", "--origin", ORIGIN, "--out", "there.gpkg")
+    assert half.code == 0, half.err
+    spoken = coverage(read_map(tmp_path / "map.geojson", plane), plane)
+    elsewhere = coverage(read_map(tmp_path / "there.gpkg", PLANE), PLANE)
+    assert spoken.area == pytest.approx(elsewhere.area, rel=0.02)
+    assert spoken.area == pytest.approx(12 * 4.5 * 26.0 + 56.0 * 26.0 - 4.5 * 26.0, rel=0.1)
+    with FrameWriter(tmp_path / "frames.parquet", told | {"location": "boston-seaport"}) as writer:
+        writer.write("scene-0007", 0, drive.frames[0])
+    lost = predmapnet("integrate", "frames.parquet", "--out", "map.geojson")
+    assert lost.code == 2
+    assert "--origin" in lost.err

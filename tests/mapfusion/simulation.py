@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,8 +10,10 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
+from mapfusion.coverage import ground_within
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
+from mapfusion.visibility import CameraSector, visible_ground
 
 Float = NDArray[np.float64]
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
@@ -142,8 +145,12 @@ def simulate(
     rng: np.random.Generator,
     detector: Detector | None = None,
     period: float = 0.5,
+    trucks: Sequence[Sequence[Float]] | None = None,
 ) -> Drive:
-    """Drive along poses and report what the detector makes of the true elements in the ROI."""
+    """Drive along poses and report what the detector makes of the true elements in the ROI.
+
+    ``trucks`` are the outlines, global frame, that stand in the way in each frame; frames then say what is visible.
+    """
     detector = detector or Detector()
     track_of: dict[tuple[int, int], int] = {}
     next_track = 0
@@ -153,10 +160,16 @@ def simulate(
     box = shapely.box(*(-ROI.size / 2), *(ROI.size / 2))
     for number, ego_to_global in enumerate(poses):
         global_to_ego = inverse_pose(ego_to_global)
+        visible: tuple[Float, ...] | None = None
+        open_ground: shapely.Geometry = box
+        if trucks is not None:
+            things = [transform_points(global_to_ego, truck) for truck in trucks[number]]
+            visible = visible_ground(ROI, [CameraSector(np.zeros(2))], things)
+            open_ground = ground_within(visible)
         found: list[tuple[int, float, int, Float]] = []
         for row, true in enumerate(truth):
             local = transform_points(global_to_ego, true.points)
-            for part, piece in enumerate(visible_pieces(true.kind, local, box)):
+            for part, piece in enumerate(visible_pieces(true.kind, local, open_ground)):
                 if rng.random() < detector.drop_out:
                     continue
                 key = (row, part)
@@ -185,6 +198,7 @@ def simulate(
                 scores=np.array([f[1] for f in found]),
                 track_ids=np.array([f[2] for f in found], dtype=np.int64),
                 polylines=tuple(f[3] for f in found),
+                visible=visible,
             )
         )
     return Drive(truth, tuple(frames), tuple(Ghost(g[0], g[1], tuple(g[2])) for g in ghosts))

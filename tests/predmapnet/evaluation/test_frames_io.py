@@ -27,6 +27,7 @@ def frame_map(count, generator, forecasts=True):
         forecasts=tuple(np.zeros((0, 2)) if row % 2 else line + 1.0 for row, line in enumerate(lines))
         if forecasts
         else None,
+        visible=(generator.normal(size=(5, 2)), generator.normal(size=(3, 2))) if forecasts else None,
     )
 
 
@@ -44,11 +45,22 @@ def test_frames_come_back_bit_by_bit(tmp_path):
         assert (got.timestamp, got.roi) == (written.timestamp, written.roi)
         for name in ("ego_to_global", "kinds", "scores", "track_ids"):
             np.testing.assert_array_equal(getattr(got, name), getattr(written, name))
-        for lines, expected in ((got.polylines, written.polylines), (got.forecasts, written.forecasts)):
+        for lines, expected in (
+            (got.polylines, written.polylines),
+            (got.forecasts, written.forecasts),
+            (got.visible, written.visible),
+        ):
             assert (lines is None) == (expected is None)
             for line, other in zip(lines or (), expected or (), strict=True):
                 np.testing.assert_array_equal(line, other)
     assert [entry.name for entry in tmp_path.iterdir()] == ["frames.parquet"]
+
+
+def test_a_file_that_does_not_say_what_was_visible_is_read(tmp_path):
+    path = tmp_path / "frames.parquet"
+    write_frames(path, "scene-0103", [frame_map(2, np.random.default_rng(1))], {})
+    pq.write_table(pq.read_table(path).drop_columns(["visible"]), path)
+    assert read_frames(path).frames[0].frame_map.visible is None
 
 
 def test_one_scene_of_many_is_read_alone(tmp_path):
