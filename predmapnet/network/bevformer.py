@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from predmapnet.network.camera_pillars import CameraPillars, pixel_positions
 from predmapnet.network.deformable_attention import deformable_attention
 from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.matrix_product import Linear
 from predmapnet.network.temporal_fusion import TemporalFusion
 
 IMAGE_LEVELS = 3
@@ -36,10 +37,10 @@ class BevSelfAttention(nn.Module):
         self.grid = (config.rows, config.columns)
         self.mirrored = config.quirks.mirrored_self_attention
         samples = self.heads * self.QUEUE * self.POINTS
-        self.sampling_offsets = nn.Linear(2 * width, 2 * samples)
-        self.attention_weights = nn.Linear(2 * width, samples)
-        self.value = nn.Linear(width, width)
-        self.output = nn.Linear(width, width)
+        self.sampling_offsets = Linear(2 * width, 2 * samples)
+        self.attention_weights = Linear(2 * width, samples)
+        self.value = Linear(width, width)
+        self.output = Linear(width, width)
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, cells: Tensor, code: Tensor) -> Tensor:
@@ -83,10 +84,10 @@ class ImageCrossAttention(nn.Module):
         super().__init__()
         width, self.heads = config.bev_width, config.bev_heads
         samples = self.heads * IMAGE_LEVELS * self.POINTS
-        self.sampling_offsets = nn.Linear(width, 2 * samples)
-        self.attention_weights = nn.Linear(width, samples)
-        self.value = nn.Linear(width, width)
-        self.output = nn.Linear(width, width)
+        self.sampling_offsets = Linear(width, 2 * samples)
+        self.attention_weights = Linear(width, samples)
+        self.value = Linear(width, width)
+        self.output = Linear(width, width)
         self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, cells: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor) -> Tensor:
@@ -138,8 +139,8 @@ class ResidualPerceptron(nn.Module):
 
     def __init__(self, width: int, hidden: int, dropout: float) -> None:
         super().__init__()
-        self.first = nn.Linear(width, hidden)
-        self.second = nn.Linear(hidden, width)
+        self.first = Linear(width, hidden)
+        self.second = Linear(hidden, width)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, tokens: Tensor) -> Tensor:

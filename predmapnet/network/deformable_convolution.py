@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.network.bilinear_sampling import bilinear_corners, weighted_rows
+from predmapnet.network.matrix_product import linear
 
 TAPS = 9
 
@@ -37,7 +38,7 @@ class DeformableConvolution(nn.Module):
         pixels = features.permute(0, 2, 3, 1).reshape(-1, channels)
         samples = weighted_rows(pixels, indices, shares.view(-1, 4)).view(-1, TAPS * channels)
         kernel = self.weight.permute(0, 2, 3, 1).reshape(-1, TAPS * channels)
-        return (samples @ kernel.T).view(batch, height, width, -1).permute(0, 3, 1, 2)
+        return linear(samples, kernel).view(batch, height, width, -1).permute(0, 3, 1, 2)
 
     @staticmethod
     def _positions(moves: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from predmapnet.network.matrix_product import Linear
+
 
 class Attention(nn.Module):
     """Multi-head attention with separate query and key/value inputs.
@@ -73,8 +75,8 @@ class FeedForward(nn.Module):
         return self.norm(tokens + self.perceptron(tokens))
 
 
-class Pointwise(nn.Linear):
-    """A 1x1 convolution as the matrix product that it is; on one CPU thread torch has no fast path for the former."""
+class Pointwise(Linear):
+    """A 1x1 convolution as the matrix product that it is."""
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, C_in, h, w)`` to ``(B, C_out, h, w)``, channels-last in memory."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from predmapnet.network.bevformer import ResidualPerceptron
 from predmapnet.network.deformable_attention import deformable_attention
 from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.matrix_product import Linear
 from predmapnet.network.vector_memory import Recalled
 
 
@@ -43,7 +44,7 @@ class LineCrossAttention(nn.Module):
         samples = self.heads * config.points
         self.sampling_offsets = nn.Linear(width, 2 * samples)
         self.attention_weights = nn.Linear(width, samples)
-        self.value = nn.Linear(width, width)
+        self.value = Linear(width, width)
         self.output = nn.Linear(width, width)
         self.dropout = nn.Dropout(config.dropout)
 

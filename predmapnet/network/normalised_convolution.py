@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from predmapnet.network.matrix_product import linear
+
 
 class NormalisedConvolution(nn.Module):
     """Convolution without bias, then batch norm.
@@ -27,8 +29,6 @@ class NormalisedConvolution(nn.Module):
         scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
         shift = norm.bias - norm.running_mean * scale
         kernel = convolution.weight * scale[:, None, None, None]
-        if convolution.kernel_size == (1, 1):
-            down, across = convolution.stride
-            pixels = features[:, :, ::down, ::across].permute(0, 2, 3, 1)
-            return F.linear(pixels, kernel.flatten(1), shift).permute(0, 3, 1, 2)
+        if convolution.kernel_size == (1, 1) and convolution.stride == (1, 1):
+            return linear(features.permute(0, 2, 3, 1), kernel.flatten(1), shift).permute(0, 3, 1, 2)
         return F.conv2d(features, kernel, shift, convolution.stride, convolution.padding)

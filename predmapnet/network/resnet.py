@@ -45,7 +45,7 @@ class Bottleneck(nn.Module):
         """Map ``(N, C_in, h, w)`` to ``(N, 4 width, h / stride, w / stride)``."""
         hidden = F.relu(self.reduce(features), inplace=True)
         hidden = F.relu(self.spatial(hidden), inplace=True)
-        return F.relu(self.expand(hidden) + self.shortcut(features), inplace=True)
+        return F.relu(self.expand(hidden).add_(self.shortcut(features)), inplace=True)
 
 
 class ResNet50(nn.Module):

@@ -1,0 +1,49 @@
+"""Matrix products of many rows, by the fastest way that torch has on a CPU."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+MANY_ROWS = 512
+"""From here on a convolution's greater overhead pays."""
+
+SMALLEST_BATCH = 16
+"""From this batch on, torch gives 1x1 convolutions to oneDNN with any number of threads."""
+
+
+def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Compute what ``F.linear`` computes.
+
+    On a CPU, torch multiplies matrices by MKL, which runs at less than half the machine's rate unless Intel made it,
+    and convolutions by oneDNN, which does not. So many rows are put as the pixels of a 1x1 convolution.
+
+    Args:
+        tokens: ``(..., C_in)``.
+        weight: ``(C_out, C_in)``.
+        bias: ``(C_out)``.
+
+    Returns:
+        ``(..., C_out)``.
+    """
+    rows = tokens.numel() // weight.shape[1]
+    batch = _divisor(rows) if rows >= MANY_ROWS and tokens.device.type == "cpu" else None
+    if batch is None or not torch.backends.mkldnn.is_available():
+        return F.linear(tokens, weight, bias)
+    pixels = tokens.reshape(batch, rows // batch, 1, -1).permute(0, 3, 1, 2)
+    product = F.conv2d(pixels, weight[:, :, None, None], bias)
+    return product.permute(0, 2, 3, 1).reshape(*tokens.shape[:-1], -1)
+
+
+def _divisor(rows: int) -> int | None:
+    """Return a number that the rows can be divided by, for a batch of images."""
+    return next((batch for batch in range(SMALLEST_BATCH, 4 * SMALLEST_BATCH) if rows % batch == 0), None)
+
+
+class Linear(nn.Linear):
+    """A linear layer for many rows: cells of a map, pixels of images."""
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Map ``(..., C_in)`` to ``(..., C_out)``."""
+        return linear(tokens, self.weight, self.bias)
