@@ -193,6 +193,22 @@ class TrackingConfig(Section):
     report_threshold: Fraction = 0.05
 
 
+class RevivalConfig(Section):
+    """Lost tracks that may come back, which the paper does not have.
+
+    Attributes:
+        enabled: switch.
+        frames: k; how many frames a track may be missing and still get its id back.
+        distance: chamfer distance in metres of a lost track and a newborn one, where both could be seen.
+        capacity: lost tracks remembered per stream; those that are missing for longest make room.
+    """
+
+    enabled: bool = True
+    frames: Positive = 10
+    distance: Metres = 1.5
+    capacity: Positive = 32
+
+
 class DepthConfig(Section):
     """Auxiliary depth head (training only): depth bins over ``[near, far]`` metres."""
 
@@ -223,6 +239,7 @@ class PredMapNetConfig(Section):
     future: FutureConfig = FutureConfig()
     decoder: DecoderConfig = DecoderConfig()
     tracking: TrackingConfig = TrackingConfig()
+    revival: RevivalConfig = RevivalConfig()
     depth: DepthConfig = DepthConfig()
 
     @property

@@ -151,7 +151,7 @@ class Mapper:
             state = self.network.initial_state(1)
         outputs = self.network(inputs, self._lookup(frame.rig), state)
         selection = select(outputs, state, self.config)
-        state = self.network.advance(state, outputs, selection.instances, inputs)
+        state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
         frame_map = to_frame_map(
             selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
         )

@@ -56,6 +56,35 @@ class Instances:
 
 
 @dataclass
+class LostTracks:
+    """Tracks that ended a while ago and may come back (:mod:`predmapnet.network.revival`). Rows are padded.
+
+    ``L`` is the number of rows; everything is as of the last frame in which the track lived.
+
+    Attributes:
+        valid: ``(B, L) bool``.
+        track_ids: ``(B, L) int64``.
+        labels: ``(B, L) int64``.
+        missing: ``(B, L) int64``, frames in which the track did not live, before the present one.
+        ego_to_global: ``(B, L, 4, 4) float64``.
+        history_maps: ``(B, L, H_m, W_m)``.
+        point_history: ``(B, L, n, P, 2)``.
+        point_history_valid: ``(B, L, n) bool``.
+        recent_poses: ``(B, n, 4, 4) float64``, of the stream's last n frames before the present one, oldest first.
+    """
+
+    valid: Tensor
+    track_ids: Tensor
+    labels: Tensor
+    missing: Tensor
+    ego_to_global: Tensor
+    history_maps: Tensor
+    point_history: Tensor
+    point_history_valid: Tensor
+    recent_poses: Tensor
+
+
+@dataclass
 class StreamState:
     """Everything the network remembers between two frames; nothing is hidden in a module.
 
@@ -71,6 +100,7 @@ class StreamState:
         bev_memory: ``(B, K, C_bev, H, W)``, past BEV maps (newest last).
         bev_memory_pose: ``(B, K, 4, 4) float64``.
         bev_memory_valid: ``(B, K) bool``.
+        lost: tracks that may come back, or None where nobody keeps them.
     """
 
     instances: Instances
@@ -83,19 +113,24 @@ class StreamState:
     bev_memory: Tensor
     bev_memory_pose: Tensor
     bev_memory_valid: Tensor
+    lost: LostTracks | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the state as named tensors, to be saved (safetensors) and read back by :meth:`from_tensors`."""
         named = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return named | {f"instances.{name}": value for name, value in vars(self.instances).items()}
+        named |= {f"instances.{name}": value for name, value in vars(self.instances).items()}
+        lost = {} if self.lost is None else vars(self.lost)
+        return named | {f"lost.{name}": value for name, value in lost.items()}
 
     @classmethod
     def from_tensors(cls, named: Mapping[str, Tensor]) -> StreamState:
         """Make the state that :meth:`tensors` named."""
-        prefix = "instances."
-        instances = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
-        rest = {name: value for name, value in named.items() if not name.startswith(prefix)}
-        return cls(instances=Instances(**instances), **rest)
+        parts: dict[str, dict[str, Tensor]] = {"": {}, "instances": {}, "lost": {}}
+        for name, value in named.items():
+            part, _, field = name.rpartition(".")
+            parts[part][field] = value
+        lost = LostTracks(**parts["lost"]) if parts["lost"] else None
+        return cls(instances=Instances(**parts["instances"]), lost=lost, **parts[""])
 
 
 @dataclass
@@ -124,6 +159,7 @@ class FrameOutputs:
         row_track_ids: ``(B, T + Q) int64``; -1 for detections.
         segmentation: ``(B, 3, H_s, W_s)`` logits.
         bev: ``(B, C_bev, H, W)``, raw BEV features that go into the memory.
+        ego_to_global: ``(B, 4, 4) float64``, pose of the instant.
         depth: ``(B, N, D, h', w')`` logits of the auxiliary head, or None.
         warped_history: ``(B, T, H_m, W_m)``, history maps of the track rows in this frame's ego frame, or None.
     """
@@ -134,6 +170,7 @@ class FrameOutputs:
     row_track_ids: Tensor
     segmentation: Tensor
     bev: Tensor
+    ego_to_global: Tensor
     depth: Tensor | None = None
     warped_history: Tensor | None = None
 
@@ -162,7 +199,9 @@ class Selection:
     Attributes:
         instances: tracks that live on, newborns included.
         detections: further rows above the report threshold, for precision-recall curves; ``track_ids`` are -1.
+        lost: tracks that ended, those that came back in this frame included; None without revival.
     """
 
     instances: Instances
     detections: Instances
+    lost: LostTracks | None = None

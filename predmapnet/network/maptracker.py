@@ -119,6 +119,7 @@ class MapTracker(nn.Module):
             row_track_ids=torch.cat([state.instances.track_ids, detection_ids], dim=1),
             segmentation=self.raster_head(bev),
             bev=bev,
+            ego_to_global=inputs.ego_to_global,
         )
 
     def encode_bev(self, inputs: FrameInputs, pillars: CameraPillars, history: BevHistory) -> Tensor:

@@ -21,14 +21,16 @@ from predmapnet.network.interface import (
     FrameOutputs,
     Instances,
     LayerPredictions,
+    LostTracks,
     StreamState,
 )
 from predmapnet.network.map_decoder import MapDecoder, visible_rows
+from predmapnet.network.revival import recall, still_lost
 from predmapnet.network.segmentation_head import SegmentationHead
 from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
 from predmapnet.network.temporal_bev import TemporalBevFusion, empty_memory, remember_bev
+from predmapnet.network.track_memory import memory_of_tracks
 from predmapnet.network.track_propagation import TrackPropagation
-from predmapnet.network.tracking import match_tracks
 from predmapnet.network.view_transform import RigLookup, make_rig_lookup, to_ground
 
 
@@ -38,8 +40,8 @@ class PredMapNet(nn.Module):
     One step of a stream::
 
         outputs = net(inputs, lookup, state)
-        selection = select(outputs, state, net.config.tracking)
-        state = net.advance(state, outputs, selection.instances, inputs)
+        selection = select(outputs, state, net.config)
+        state = net.advance(state, outputs, selection.instances, inputs, selection.lost)
     """
 
     def __init__(self, config: PredMapNetConfig) -> None:
@@ -148,6 +150,7 @@ class PredMapNet(nn.Module):
             row_track_ids=torch.cat([state.instances.track_ids, detection_rows.long().neg()], dim=1),
             segmentation=self.segmentation_head(fine),
             bev=raw,
+            ego_to_global=inputs.ego_to_global,
             depth=bev.depth,
             warped_history=history,
         )
@@ -186,7 +189,12 @@ class PredMapNet(nn.Module):
         return layers
 
     def advance(
-        self, state: StreamState | None, outputs: FrameOutputs, instances: Instances, inputs: FrameInputs
+        self,
+        state: StreamState | None,
+        outputs: FrameOutputs,
+        instances: Instances,
+        inputs: FrameInputs,
+        lost: LostTracks | None = None,
     ) -> StreamState:
         """Carry the instances that live on into the state of the next frame.
 
@@ -197,18 +205,21 @@ class PredMapNet(nn.Module):
             outputs: that came out.
             instances: chosen by :func:`predmapnet.network.tracking.select` or by the training.
             inputs: of the same frame; only the poses are used.
+            lost: what the selection says of lost tracks; without it, a track that ended is forgotten.
         """
         if state is None:
             state = self.initial_state(len(inputs.ego_to_global))
-        source, matched = match_tracks(instances, state.instances)
+        warped = outputs.warped_history if self.config.history_map.memory else None
+        memory = memory_of_tracks(instances, state, warped)
+        if lost is not None:
+            memory = recall(memory, instances, lost, inputs.ego_to_global, self.config.roi)
         history_maps = instances.masks
-        if self.config.history_map.memory:
-            assert outputs.warped_history is not None
+        if memory.history_maps is not None:
             history_maps = self.history_memory.update(
-                instances.masks, instances.scores, outputs.warped_history, source, matched
+                instances.masks, instances.scores, memory.history_maps, memory.source, memory.matched
             )
         history, history_valid = extend_history(
-            state.point_history, state.point_history_valid, instances.points, source, matched
+            memory.point_history, memory.point_history_valid, instances.points, memory.source, memory.matched
         )
         forecasts = instances.points
         if self.future_guidance is not None:
@@ -227,6 +238,7 @@ class PredMapNet(nn.Module):
             bev_memory=maps,
             bev_memory_pose=poses,
             bev_memory_valid=valid,
+            lost=None if lost is None else still_lost(lost, instances),
         )
 
 

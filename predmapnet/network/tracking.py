@@ -11,6 +11,7 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PredMapNetConfig, TrackingConfig
 from predmapnet.network.interface import FrameOutputs, Instances, Selection, StreamState
 from predmapnet.network.polylines import chamfer_distances, resample_polylines
+from predmapnet.network.revival import revive
 
 
 @torch.no_grad()
@@ -20,7 +21,8 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
     Tracks keep their ids. With merging, a track takes up the detections of its class that lie close to it: it gets the
     query and geometry of the higher score and the noisy-or of both scores, and what was taken up is gone; of two tracks
     of one thing the older lives on, of two newborns the one with the higher score. A track ends after too many
-    frames without support (``tau_t``); a detection above ``tau_d`` that nothing took up is born.
+    frames without support (``tau_t``); a detection above ``tau_d`` that nothing took up is born, with the id of a lost
+    track if it is found to be one.
 
     Args:
         outputs: of this frame.
@@ -33,9 +35,11 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
     detection_rows, detection_scores = rows.rows[:, tracks:], rows.scores[:, tracks:]
     source, scores, alive = rows.rows[:, :tracks], rows.scores[:, :tracks], rows.valid[:, :tracks]
     free = rows.valid[:, tracks:]
+    repeats = torch.zeros_like(alive)
     if rules.merge:
         distances = _line_distances(outputs, rows, config.roi, rules)
-        alive = alive & ~_has_older_twin(distances[:, :tracks, :tracks], rows.track_ids, rules)
+        repeats = _has_older_twin(distances[:, :tracks, :tracks], rows.track_ids, rules)
+        alive = alive & ~repeats
         source, scores, taken = _take_up(distances[:, :tracks, tracks:], rows, alive, rules)
         free = free & ~taken
         free = free & ~_has_better_twin(distances[:, tracks:, tracks:], free & (detection_scores > rules.tau_d), rules)
@@ -55,7 +59,10 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
     )
     no_id, no_misses = torch.full_like(new_ids, -1), torch.zeros_like(new_ids)
     detections = _compact(outputs, detection_rows, free & ~born, no_id, no_misses, detection_scores)
-    return Selection(instances, detections)
+    if state is None or not config.revival.enabled:
+        return Selection(instances, detections)
+    instances, lost = revive(instances, state, repeats, outputs.ego_to_global, config)
+    return Selection(instances, detections, lost)
 
 
 @dataclass
@@ -194,16 +201,3 @@ def instances_from_rows(
         points=last.points[stream, rows],
         masks=masks,
     )
-
-
-def match_tracks(instances: Instances, former: Instances) -> tuple[Tensor, Tensor]:
-    """Find the row of each instance among the tracks of the last frame, by track id.
-
-    Returns:
-        ``(B, T') int64`` rows (0 where there is none) and ``(B, T') bool``, whether there is one.
-    """
-    if former.track_ids.shape[1] == 0:
-        return torch.zeros_like(instances.track_ids), torch.zeros_like(instances.valid)
-    same = instances.track_ids[:, :, None] == former.track_ids[:, None, :]
-    same = same & instances.valid[:, :, None] & former.valid[:, None, :]
-    return same.long().argmax(dim=2), same.any(dim=2)

@@ -126,10 +126,9 @@ class TemporalStage:
         """Return plan, state and owners of the streams."""
         tensors = {f"plan.{name}": value for name, value in self._plan.tensors().items()}
         tensors |= {f"owners.{name}": value for name, value in vars(self._owners).items()}
-        for name, value in vars(self._state).items():
-            if isinstance(value, Tensor):
-                tensors[f"state.{name}"] = value
-        return tensors | {f"instances.{name}": value for name, value in vars(self._state.instances).items()}
+        for name, value in self._state.tensors().items():
+            tensors[name if name.startswith("instances.") else f"state.{name}"] = value
+        return tensors
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Continue from what :meth:`state` returned."""
@@ -139,7 +138,8 @@ class TemporalStage:
 
         self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
         self._owners = Owners(**part("owners."))
-        self._state = StreamState(instances=Instances(**part("instances.")), **part("state."))
+        instances = {f"instances.{name}": value for name, value in part("instances.").items()}
+        self._state = StreamState.from_tensors(part("state.") | instances)
         if self._clips is not None:
             self._clips.plan = self._plan
 
@@ -202,11 +202,10 @@ def forget(state: StreamState, streams: Tensor) -> StreamState:
         point_history_valid=state.point_history_valid & keep[:, :, None],
         next_track_id=state.next_track_id.masked_fill(streams, 0),
         bev_memory_valid=state.bev_memory_valid & keep,
+        lost=None if state.lost is None else replace(state.lost, valid=state.lost.valid & keep),
     )
 
 
 def detached(state: StreamState) -> StreamState:
     """Return the state without its gradient history."""
-    instances = Instances(**{name: value.detach() for name, value in vars(state.instances).items()})
-    tensors = {name: value.detach() for name, value in vars(state).items() if isinstance(value, Tensor)}
-    return StreamState(instances=instances, **tensors)
+    return StreamState.from_tensors({name: value.detach() for name, value in state.tensors().items()})

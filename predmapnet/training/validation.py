@@ -84,7 +84,7 @@ def map_frames(
         inputs = _inputs(scene, index, config)
         outputs = network(inputs, lookup, state)
         selection = select(outputs, state, config)
-        after = network.advance(state, outputs, selection.instances, inputs)
+        after = network.advance(state, outputs, selection.instances, inputs, selection.lost)
         pose = scene.ego_to_global[index]
         yield to_frame_map(selection, after, outputs.segmentation, config, index * FRAME_INTERVAL_NS, pose)
         state = after if streaming else empty

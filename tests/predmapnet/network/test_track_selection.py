@@ -10,7 +10,7 @@ ROI = torch.tensor([60.0, 30.0])
 
 
 def config(**tracking):
-    return PredMapNetConfig.model_validate({"tracking": tracking})
+    return PredMapNetConfig.model_validate({"tracking": tracking, "revival": {"enabled": False}})
 
 
 class State:
@@ -40,6 +40,7 @@ def outputs(rows, state=None):
         row_track_ids=torch.tensor([ids + [-1] * (len(rows) - len(ids))]),
         segmentation=torch.zeros(1),
         bev=torch.zeros(1),
+        ego_to_global=torch.eye(4, dtype=torch.float64)[None],
     )
 
 

@@ -40,6 +40,7 @@ def outputs_at(heights: list[float], scores: list[float]) -> FrameOutputs:
         row_track_ids=torch.full((1, rows), -1),
         segmentation=torch.zeros(1, 3, 10, 20),
         bev=torch.zeros(1, 0, 10, 20),
+        ego_to_global=torch.eye(4, dtype=torch.float64)[None],
     )
 
 

@@ -1,0 +1,218 @@
+"""Lost tracks that come back, which the paper lists among what it lacks.
+
+A track that ended (its score stayed low, or it left the ROI) keeps its memory for k frames. A newborn detection of its
+class that lies where it was takes its id, history map and polylines back. Nothing is computed for lost tracks while
+they are lost: they keep the pose of the last frame in which they lived, and one step brings them to the present.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mapfusion.elements import RegionOfInterest
+from predmapnet.config import PredMapNetConfig, RevivalConfig
+from predmapnet.network.ego_motion import move_points, relative_motion, warp_bev
+from predmapnet.network.interface import Instances, LostTracks, StreamState
+from predmapnet.network.track_memory import TrackMemory, match_tracks
+
+ROUNDS = 3
+"""Contests for lost tracks that are settled; who loses one may win another."""
+
+LEAST_POINTS = 3
+"""A line that shows fewer of its points in the region that both could be seen in is not compared."""
+
+
+@torch.no_grad()
+def revive(
+    instances: Instances, state: StreamState, repeats: Tensor, ego_to_global: Tensor, config: PredMapNetConfig
+) -> tuple[Instances, LostTracks]:
+    """Give newborn tracks the ids of lost ones where they are found to be the same.
+
+    A newborn keeps the query that it was detected with: that one has seen this frame's images, and the propagation of
+    queries has only learned to bridge a single frame.
+
+    Args:
+        instances: what lives on after this frame.
+        state: of the last frame.
+        repeats: ``(B, T) bool``, tracks of the last frame that were only a second one of an older track; they do not
+            come back.
+        ego_to_global: ``(B, 4, 4) float64``, of this frame.
+        config: of the network.
+
+    Returns:
+        The instances, with the ids of the lost tracks that came back; and all lost tracks, those included.
+    """
+    lost = _lost_tracks(instances, state, repeats, config.revival)
+    if lost.valid.shape[1] == 0 or instances.valid.shape[1] == 0:
+        return instances, lost
+    newborn = instances.valid & (instances.track_ids >= state.next_track_id[:, None])
+    comparable = (lost.labels[:, :, None] == instances.labels[:, None]) & lost.valid[:, :, None] & newborn[:, None]
+    distances = _distances(lost, instances.points, ego_to_global, config.roi)
+    allowed = comparable & (distances < config.revival.distance)
+    pairs = _closest_pairs(distances.masked_fill(~allowed, torch.inf))
+    former_ids = lost.track_ids.gather(1, pairs.long().argmax(dim=1))
+    return replace(instances, track_ids=torch.where(pairs.any(dim=1), former_ids, instances.track_ids)), lost
+
+
+def recall(
+    memory: TrackMemory, instances: Instances, lost: LostTracks, ego_to_global: Tensor, roi: RegionOfInterest
+) -> TrackMemory:
+    """Add what is remembered of the lost tracks that came back, carried to this frame by the motion of the car.
+
+    Args:
+        memory: of the last frame's tracks.
+        instances: with the ids that :func:`revive` gave them.
+        lost: what it returned beside them.
+        ego_to_global: ``(B, 4, 4) float64``, of this frame.
+        roi: region of all frames.
+    """
+    row, found = match_tracks(instances, lost)
+    if lost.valid.shape[1] == 0 or instances.valid.shape[1] == 0:
+        return memory
+    revived = found & ~memory.matched
+    stream = torch.arange(len(row), device=row.device)[:, None]
+    then = lost.ego_to_global[stream, row]
+    maps = memory.history_maps
+    if maps is not None:
+        now_to_then = relative_motion(ego_to_global[:, None], then).flatten(0, 1)
+        kept = lost.history_maps[stream, row]
+        warped = warp_bev(kept.flatten(0, 1)[:, None], now_to_then, roi).view_as(kept)
+        maps = torch.cat([maps, warped], dim=1)
+    history, valid = _carried_history(lost, row, roi)
+    former = memory.point_history.shape[1]
+    return TrackMemory(
+        source=torch.where(revived, former + torch.arange(row.shape[1], device=row.device), memory.source),
+        matched=memory.matched | revived,
+        history_maps=maps,
+        point_history=torch.cat([memory.point_history, history], dim=1),
+        point_history_valid=torch.cat([memory.point_history_valid, valid], dim=1),
+    )
+
+
+def still_lost(lost: LostTracks, instances: Instances) -> LostTracks:
+    """Return the lost tracks without those that live again."""
+    lives = (lost.track_ids[:, :, None] == instances.track_ids[:, None]) & instances.valid[:, None]
+    return replace(lost, valid=lost.valid & ~lives.any(dim=2))
+
+
+def _lost_tracks(instances: Instances, state: StreamState, repeats: Tensor, rules: RevivalConfig) -> LostTracks:
+    """Put the tracks that end in this frame before those that were lost already, and let the oldest ones go."""
+    tracks, histories = state.instances, state.point_history.shape[2]
+    lives = (tracks.track_ids[:, :, None] == instances.track_ids[:, None]) & instances.valid[:, None]
+    pose = state.ego_to_global[:, None]
+    ended = LostTracks(
+        valid=tracks.valid & ~lives.any(dim=2) & ~repeats,
+        track_ids=tracks.track_ids,
+        labels=tracks.labels,
+        missing=torch.zeros_like(tracks.track_ids),
+        ego_to_global=pose.expand(-1, tracks.valid.shape[1], -1, -1),
+        history_maps=state.history_maps,
+        point_history=state.point_history,
+        point_history_valid=state.point_history_valid,
+        recent_poses=pose.expand(-1, histories, -1, -1),
+    )
+    if state.lost is None:
+        return ended
+    missing = state.lost.missing + 1
+    before = replace(state.lost, missing=missing, valid=state.lost.valid & (missing <= rules.frames))
+    valid = torch.cat([ended.valid, before.valid], dim=1)
+    order = (~valid).long().argsort(dim=1, stable=True)[:, : rules.capacity]
+    stream = torch.arange(len(order), device=order.device)[:, None]
+    rows = {
+        name: torch.cat([value, getattr(before, name)], dim=1)[stream, order]
+        for name, value in vars(ended).items()
+        if name != "recent_poses"
+    }
+    return LostTracks(**rows, recent_poses=torch.cat([before.recent_poses[:, 1:], pose], dim=1))
+
+
+def _distances(lost: LostTracks, points: Tensor, ego_to_global: Tensor, roi: RegionOfInterest) -> Tensor:
+    """Chamfer distances ``(B, L, K)`` in metres of lost tracks and instances ``(B, K, P, 2)``.
+
+    Of each line only what lies in the ROI of both instants counts: the rest could not be seen at the other one.
+    """
+    size = points.new_tensor([roi.length, roi.width])
+    pose, (streams, rows) = ego_to_global[:, None], lost.valid.shape
+    last = lost.point_history[:, :, -1]
+    then_to_now, now_to_then = relative_motion(lost.ego_to_global, pose), relative_motion(pose, lost.ego_to_global)
+    carried = move_points(last.flatten(0, 1), then_to_now.flatten(0, 1), roi).view_as(last)
+    taken_back = points[:, None].expand(-1, rows, -1, -1, -1)
+    taken_back = move_points(taken_back.flatten(0, 1), now_to_then.flatten(0, 1), roi).unflatten(0, (streams, rows))
+    there = _mean_where(point_line_distances(carried * size, points * size), _inside(carried)[:, :, None])
+    back = point_line_distances(points * size, carried * size).transpose(1, 2)
+    return (there + _mean_where(back, _inside(taken_back))) / 2
+
+
+def point_line_distances(points: Tensor, lines: Tensor) -> Tensor:
+    """Distance of each point of some lines to each of other lines.
+
+    Args:
+        points: ``(B, L, P, 2)``, metres.
+        lines: ``(B, K, S, 2)``, metres.
+
+    Returns:
+        ``(B, L, K, P)``.
+    """
+    steps = torch.diff(lines, dim=2)[:, None, :, None]
+    offset = points[:, :, None, :, None] - lines[:, None, :, None, :-1]
+    lengths = steps.square().sum(dim=-1).clamp(min=1e-9)
+    share = ((offset * steps).sum(dim=-1) / lengths).clamp(0.0, 1.0)
+    return (offset - share[..., None] * steps).square().sum(dim=-1).amin(dim=-1).sqrt()
+
+
+def _inside(points: Tensor) -> Tensor:
+    return ((points >= 0) & (points <= 1)).all(dim=-1)
+
+
+def _mean_where(values: Tensor, counted: Tensor) -> Tensor:
+    """Mean over the last dimension of what is counted; infinite where that is too little."""
+    number = counted.sum(dim=-1)
+    mean = (values * counted).sum(dim=-1) / number.clamp(min=1)
+    return mean.masked_fill(number < LEAST_POINTS, torch.inf)
+
+
+def _closest_pairs(distances: Tensor) -> Tensor:
+    """Pair rows with columns one to one, the closest first; infinite distances are never paired.
+
+    Two that are each other's nearest are paired whoever else is considered first, so all such pairs are taken at once.
+
+    Args:
+        distances: ``(B, L, K)``.
+
+    Returns:
+        ``(B, L, K) bool``.
+    """
+    _, rows, columns = distances.shape
+    row = torch.arange(rows, device=distances.device)[:, None]
+    column = torch.arange(columns, device=distances.device)
+    pairs = torch.zeros_like(distances, dtype=torch.bool)
+    for _ in range(ROUNDS):
+        nearest = (distances.argmin(dim=2, keepdim=True) == column) & (distances.argmin(dim=1, keepdim=True) == row)
+        nearest = nearest & distances.isfinite()
+        pairs = pairs | nearest
+        distances = distances.masked_fill(
+            nearest.any(dim=2, keepdim=True) | nearest.any(dim=1, keepdim=True), torch.inf
+        )
+    return pairs
+
+
+def _carried_history(lost: LostTracks, row: Tensor, roi: RegionOfInterest) -> tuple[Tensor, Tensor]:
+    """Histories ``(B, K, n, P, 2)`` and validity of lost tracks ``row (B, K)``, up to the last frame.
+
+    The frames in which a track was missing are filled with its last polyline, as it lay in the ego frame of each; so
+    the forecast sees the car move from one slot to the next as ever.
+    """
+    stream = torch.arange(len(row), device=row.device)[:, None]
+    missing = lost.missing[stream, row][..., None]
+    length = lost.point_history.shape[2]
+    slots = torch.arange(length, device=row.device).expand(*row.shape, length)
+    old = (slots + missing).clamp(max=length - 1)
+    history = lost.point_history[stream[..., None], row[..., None], old]
+    valid = lost.point_history_valid[stream[..., None], row[..., None], old]
+    motion = relative_motion(lost.ego_to_global[stream, row][:, :, None], lost.recent_poses[:, None])
+    carried = move_points(history.flatten(0, 2), motion.flatten(0, 2), roi).view_as(history)
+    filled = slots >= length - missing
+    return torch.where(filled[..., None, None], carried, history), valid
