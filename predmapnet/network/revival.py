@@ -46,13 +46,15 @@ def revive(
         The instances, with the ids of the lost tracks that came back; and all lost tracks, those included.
     """
     lost = _lost_tracks(instances, state, repeats, config.revival)
-    if lost.valid.shape[1] == 0 or instances.valid.shape[1] == 0:
-        return instances, lost
     newborn = instances.valid & (instances.track_ids >= state.next_track_id[:, None])
     comparable = (lost.labels[:, :, None] == instances.labels[:, None]) & lost.valid[:, :, None] & newborn[:, None]
-    distances = _distances(lost, instances.points, ego_to_global, config.roi)
-    allowed = comparable & (distances < config.revival.distance)
-    pairs = _closest_pairs(distances.masked_fill(~allowed, torch.inf))
+    # In most frames there is no such pair. The selection has just waited for the device, so asking costs little.
+    candidates = comparable.nonzero()
+    if len(candidates) == 0:
+        return instances, lost
+    distances = torch.full_like(comparable, torch.inf, dtype=instances.points.dtype)
+    distances[candidates.unbind(dim=1)] = _distances(candidates, lost, instances.points, ego_to_global, config.roi)
+    pairs = _closest_pairs(distances.masked_fill(distances >= config.revival.distance, torch.inf))
     former_ids = lost.track_ids.gather(1, pairs.long().argmax(dim=1))
     return replace(instances, track_ids=torch.where(pairs.any(dim=1), former_ids, instances.track_ids)), lost
 
@@ -70,9 +72,9 @@ def recall(
         roi: region of all frames.
     """
     row, found = match_tracks(instances, lost)
-    if lost.valid.shape[1] == 0 or instances.valid.shape[1] == 0:
-        return memory
     revived = found & ~memory.matched
+    if not revived.any():
+        return memory
     stream = torch.arange(len(row), device=row.device)[:, None]
     then = lost.ego_to_global[stream, row]
     maps = memory.history_maps
@@ -129,37 +131,45 @@ def _lost_tracks(instances: Instances, state: StreamState, repeats: Tensor, rule
     return LostTracks(**rows, recent_poses=torch.cat([before.recent_poses[:, 1:], pose], dim=1))
 
 
-def _distances(lost: LostTracks, points: Tensor, ego_to_global: Tensor, roi: RegionOfInterest) -> Tensor:
-    """Chamfer distances ``(B, L, K)`` in metres of lost tracks and instances ``(B, K, P, 2)``.
+def _distances(pairs: Tensor, lost: LostTracks, points: Tensor, ego_to_global: Tensor, roi: RegionOfInterest) -> Tensor:
+    """Chamfer distances in metres of lost tracks and instances.
 
     Of each line only what lies in the ROI of both instants counts: the rest could not be seen at the other one.
+
+    Args:
+        pairs: ``(M, 3)``: stream, lost track, instance.
+        lost: lost tracks.
+        points: ``(B, K, P, 2)``, of the instances, normalised.
+        ego_to_global: ``(B, 4, 4) float64``, of this frame.
+        roi: region of all frames.
+
+    Returns:
+        ``(M,)``.
     """
+    stream, row, column = pairs.unbind(dim=1)
     size = points.new_tensor([roi.length, roi.width])
-    pose, (streams, rows) = ego_to_global[:, None], lost.valid.shape
-    last = lost.point_history[:, :, -1]
-    then_to_now, now_to_then = relative_motion(lost.ego_to_global, pose), relative_motion(pose, lost.ego_to_global)
-    carried = move_points(last.flatten(0, 1), then_to_now.flatten(0, 1), roi).view_as(last)
-    taken_back = points[:, None].expand(-1, rows, -1, -1, -1)
-    taken_back = move_points(taken_back.flatten(0, 1), now_to_then.flatten(0, 1), roi).unflatten(0, (streams, rows))
-    there = _mean_where(point_line_distances(carried * size, points * size), _inside(carried)[:, :, None])
-    back = point_line_distances(points * size, carried * size).transpose(1, 2)
-    return (there + _mean_where(back, _inside(taken_back))) / 2
+    then, now = lost.ego_to_global[stream, row], ego_to_global[stream]
+    found = points[stream, column]
+    carried = move_points(lost.point_history[stream, row, -1], relative_motion(then, now), roi)
+    taken_back = move_points(found, relative_motion(now, then), roi)
+    there = _mean_where(point_line_distances(carried * size, found * size), _inside(carried))
+    back = _mean_where(point_line_distances(found * size, carried * size), _inside(taken_back))
+    return (there + back) / 2
 
 
 def point_line_distances(points: Tensor, lines: Tensor) -> Tensor:
-    """Distance of each point of some lines to each of other lines.
+    """Distance of each point to its line.
 
     Args:
-        points: ``(B, L, P, 2)``, metres.
-        lines: ``(B, K, S, 2)``, metres.
+        points: ``(M, P, 2)``, metres.
+        lines: ``(M, S, 2)``, metres.
 
     Returns:
-        ``(B, L, K, P)``.
+        ``(M, P)``.
     """
-    steps = torch.diff(lines, dim=2)[:, None, :, None]
-    offset = points[:, :, None, :, None] - lines[:, None, :, None, :-1]
-    lengths = steps.square().sum(dim=-1).clamp(min=1e-9)
-    share = ((offset * steps).sum(dim=-1) / lengths).clamp(0.0, 1.0)
+    steps = torch.diff(lines, dim=1)[:, None]
+    offset = points[:, :, None] - lines[:, None, :-1]
+    share = ((offset * steps).sum(dim=-1) / steps.square().sum(dim=-1).clamp(min=1e-9)).clamp(0.0, 1.0)
     return (offset - share[..., None] * steps).square().sum(dim=-1).amin(dim=-1).sqrt()
 
 

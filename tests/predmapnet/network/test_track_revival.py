@@ -258,9 +258,9 @@ def test_distances_to_lines_are_those_of_shapely(vertices):
     import shapely
 
     points = torch.tensor([[-3.0, 2.0], [0.0, 0.0], [25.0, -9.0]])
-    found = point_line_distances(points[None, None], torch.tensor(vertices)[None, None])
+    found = point_line_distances(points[None], torch.tensor(vertices)[None])
     expected = shapely.distance(shapely.LineString(vertices), shapely.points(points.numpy()))
-    torch.testing.assert_close(found[0, 0, 0], torch.tensor(expected).float(), atol=1e-3, rtol=1e-4)
+    torch.testing.assert_close(found[0], torch.tensor(expected).float(), atol=1e-3, rtol=1e-4)
 
 
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
