@@ -87,6 +87,7 @@ def candidates(
     match = correspond(
         local.points,
         local.directions,
+        local.owner,
         curve,
         tangents(curve),
         reach=1.5 * config.match_distance,

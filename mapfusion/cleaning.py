@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -13,7 +15,7 @@ from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
 from mapfusion.lines import Curve, Evidence, FusedLine
 from mapfusion.rings import FusedRing
-from mapfusion.tidy import closes, tidy
+from mapfusion.tidy import closes, hairpins, tidy
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
@@ -38,7 +40,8 @@ def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) ->
     alive = _supported(odds, config.weak_log_odds) & (curve.information > 1.0 / config.max_deviation**2)
     points = smooth(curve, config)
     elements = []
-    for start, stop in _stretches(alive, int(config.max_gap / config.station_spacing)):
+    stretches = _stretches(alive, int(config.max_gap / config.station_spacing))
+    for start, stop in (part for stretch in stretches for part in _unfolded(points, *stretch)):
         rows = start + tidy(points[start:stop])
         if len(rows) < 2 or arc_length(points[rows])[-1] < config.min_length:
             continue
@@ -112,6 +115,12 @@ def _stretches(alive: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
     starts = rows[np.concatenate([[0], breaks + 1])]
     stops = rows[np.concatenate([breaks, [len(rows) - 1]])] + 1
     return list(zip(starts.tolist(), stops.tolist(), strict=True))
+
+
+def _unfolded(points: Float, start: int, stop: int) -> list[tuple[int, int]]:
+    """Cut a stretch where it turns back on itself."""
+    edges = [start, *(start + tip for tip in hairpins(points[start:stop])), stop]
+    return [(a, min(b + 1, stop)) for a, b in pairwise(edges)]
 
 
 def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]]:

@@ -32,6 +32,12 @@ class IntegratorConfig:
         min_length: shorter lines are left out of the map, metres.
         min_area: smaller crossings are left out of the map, square metres.
         max_gap: stretches without evidence up to this length are bridged inside a line, metres.
+        join_gap: ends of two lines that run into each other are joined up to this distance, metres; past ``max_gap``
+            only where the car has hardly looked between them.
+        join_views: sum of view weights up to which it has hardly looked.
+        join_angle: largest angle between the lines at the joint, degrees.
+        join_aside: how far they may miss each other sideways (twice as far at ``join_gap``), metres.
+        join_overlap: how far the ends may reach past each other, metres.
         curvature_deviation: expected second difference of a line's vertices one metre apart, metres; smaller is
             smoother.
         simplify_tolerance: largest distance between the fused and the written line, metres.
@@ -61,6 +67,11 @@ class IntegratorConfig:
     min_length: float = 2.0
     min_area: float = 2.0
     max_gap: float = 4.0
+    join_gap: float = 8.0
+    join_views: float = 3.0
+    join_angle: float = 40.0
+    join_aside: float = 1.0
+    join_overlap: float = 5.0
     curvature_deviation: float = 0.1
     simplify_tolerance: float = 0.05
     max_speed: float = 100.0

@@ -14,6 +14,7 @@ from mapfusion.association import Candidate, assign, candidates, gather
 from mapfusion.cleaning import line_elements, ring_elements
 from mapfusion.config import IntegratorConfig
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
+from mapfusion.joining import join
 from mapfusion.journal import Journal
 from mapfusion.lines import Curve, Evidence, FusedLine, beside, fuse
 from mapfusion.matching import Correspondence
@@ -108,8 +109,10 @@ class MapIntegrator:
             else:
                 self._clean.pop(element, None)
         self._dirty.clear()
-        elements = (element for key in sorted(self._clean) for element in self._clean[key])
-        return GlobalMap(tuple(elements), {"frames": self.frames, "integrator": asdict(self.config)})
+        elements = [element for key in sorted(self._clean) for element in self._clean[key]]
+        return GlobalMap(
+            tuple(join(elements, self.views, self.config)), {"frames": self.frames, "integrator": asdict(self.config)}
+        )
 
     def save(self, path: Path) -> None:
         """Write the state to a ``.npz`` file, to go on later with :meth:`load`; raises OSError."""

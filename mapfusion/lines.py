@@ -178,6 +178,7 @@ def beside(base: Curve, new: Curve, reach: float, angle: float) -> Correspondenc
     return correspond(
         base.points - origin,
         tangents(base.points),
+        np.zeros(len(base), dtype=np.int64),
         new.points - origin,
         tangents(new.points),
         reach,

@@ -41,13 +41,24 @@ def tangents(points: Float) -> Float:
 
 
 def correspond(
-    stations: Float, directions: Float, curve: Float, curve_tangents: Float, reach: float, angle: float, end: float
+    stations: Float,
+    directions: Float,
+    owner: Integer,
+    curve: Float,
+    curve_tangents: Float,
+    reach: float,
+    angle: float,
+    end: float,
 ) -> Correspondence:
-    """Find the stations that lie beside a curve and run along it, either way.
+    """Find the stations that lie beside a curve and run along it, each line all of one way or all of the other.
+
+    So a line that folds back on itself (the tip of a gore, the two sides of a narrow island) is matched side by side
+    and never with the wrong side, however close both are.
 
     Args:
         stations: ``(n, 2)``, metres, near the origin of coordinates (squares of large ones lose digits).
         directions: ``(n, 2)``, unit.
+        owner: ``(n,)``, number of the line that each station belongs to.
         curve: ``(m, 2)``, metres, vertices at equal distances.
         curve_tangents: ``(m, 2)``, unit.
         reach: largest lateral distance, metres.
@@ -63,13 +74,26 @@ def correspond(
     )
     points = stations[near]
     # |p - q|² without |p|², which does not change which q is nearest
-    vertex = np.argmin((curve**2).sum(axis=1)[None, :] - 2.0 * (points @ curve.T), axis=1)
-    tangent = curve_tangents[vertex]
-    gap = curve[vertex] - points
-    along = (gap * tangent).sum(axis=1)
-    offset = gap - along[:, None] * tangent
-    distance = np.sqrt((offset**2).sum(axis=1))
-    cosine = (directions[near] * tangent).sum(axis=1)
-    past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
-    keep = (distance < reach) & (np.abs(cosine) > np.cos(np.radians(angle))) & ~past & (np.abs(along) < reach)
-    return Correspondence(near[keep], vertex[keep], offset[keep], distance[keep], cosine[keep] > 0)
+    square = (curve**2).sum(axis=1)[None, :] - 2.0 * (points @ curve.T)
+    cosine = directions[near] @ curve_tangents.T
+    found = []
+    for sign in (1.0, -1.0):
+        vertex = np.argmin(np.where(sign * cosine > 0.0, square, np.inf), axis=1)
+        tangent = curve_tangents[vertex]
+        gap = curve[vertex] - points
+        along = (gap * tangent).sum(axis=1)
+        offset = gap - along[:, None] * tangent
+        distance = np.sqrt((offset**2).sum(axis=1))
+        aligned = sign * np.take_along_axis(cosine, vertex[:, None], axis=1)[:, 0] > np.cos(np.radians(angle))
+        past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
+        found.append((vertex, offset, distance, (distance < reach) & aligned & ~past & (np.abs(along) < reach)))
+    lines = owner[near]
+    count = int(lines.max(initial=-1)) + 1
+    same, opposite = (
+        np.bincount(lines[keep], weights=reach - distance[keep], minlength=count) for _, _, distance, keep in found
+    )
+    way = (same >= opposite)[lines]
+    vertex, offset, distance, keep = (
+        np.where(way if a.ndim == 1 else way[:, None], a, b) for a, b in zip(*found, strict=True)
+    )
+    return Correspondence(near[keep], vertex[keep], offset[keep], distance[keep], way[keep])

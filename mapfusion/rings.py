@@ -23,6 +23,9 @@ Window = tuple[slice, slice]
 TRUNCATION = 1.5
 """Signed distances are cut off here, so that one wrong ring moves the mean little, metres."""
 
+LOOSE_TOLERANCE = 1.5
+"""Where a crossing goes on unseen, its outline is straight to within so many cells."""
+
 CUT_RIM = 0.75
 """Edges of a ring this close to the rim of the ROI were cut by it and say nothing, metres."""
 
@@ -85,11 +88,35 @@ class FusedRing:
         return slice(a[0], b[0]), slice(a[1], b[1])
 
     def outline(self, cell: float) -> shapely.Polygon | None:
-        """Return the largest fused outline in the global frame, or None."""
+        """Return the largest fused outline in the global frame, or None; straight where it ends unseen."""
         polygons = level_polygons(self.level().astype(np.float64), 0.0)
         if not polygons:
             return None
-        return shapely.Polygon((shapely.get_coordinates(polygons[0]) + self.corner + 0.5) * cell)
+        points = shapely.get_coordinates(polygons[0])
+        shape = self.looked.shape
+        beside = [
+            np.minimum(side(points).astype(np.int64), np.array(shape) - 1).clip(0) for side in (np.floor, np.ceil)
+        ]
+        unseen = np.any([self.looked[cells[:, 0], cells[:, 1]] <= 0 for cells in beside], axis=0)
+        points = _straightened(points, np.asarray(unseen))
+        return shapely.Polygon((points + self.corner + 0.5) * cell)
+
+
+def _straightened(ring: Float, loose: NDArray[np.bool_]) -> Float:
+    """Take the steps of the lattice out of the stretches of a closed ring ``(n + 1, 2)`` whose place means nothing."""
+    if not loose.any() or loose.all():
+        return ring
+    first = int(np.argmin(loose))
+    points, loose = np.roll(ring[:-1], -first, axis=0), np.roll(loose[:-1], -first)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], loose, [False]]).astype(np.int8)))
+    keep = np.ones(len(points), dtype=bool)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        run = points[start:stop]
+        if len(run) > 2:
+            simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(run), LOOSE_TOLERANCE))
+            keep[start:stop] = (run[:, None] == simple[None]).all(axis=2).any(axis=1)
+    kept = points[keep]
+    return np.vstack([kept, kept[:1]])
 
 
 @dataclass(frozen=True)

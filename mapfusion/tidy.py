@@ -12,8 +12,30 @@ Integer = NDArray[np.int64]
 SPIKE_COSINE = np.cos(np.radians(120.0))
 """A line that turns by more than this between two stations folds back on itself."""
 
+HAIRPIN = 3
+"""A line that still runs back so many stations past a turn is no spike."""
+
 CLOSING_GAP = 2.0
 """Ends of one line this close, running into each other, are one place, metres."""
+
+
+def hairpins(points: Float) -> list[int]:
+    """Return the rows at which a line of stations turns back for good: the tip of a gore is an end of two lines.
+
+    Args:
+        points: ``(n, 2)``, metres, about one metre apart.
+    """
+    if len(points) < 2 * HAIRPIN + 1:
+        return []
+    arrive, leave = points[HAIRPIN:-HAIRPIN] - points[: -2 * HAIRPIN], points[2 * HAIRPIN :] - points[HAIRPIN:-HAIRPIN]
+    size = np.linalg.norm(arrive, axis=1) * np.linalg.norm(leave, axis=1)
+    cosine = (arrive * leave).sum(axis=1) / np.maximum(size, 1e-9)
+    tips: list[int] = []
+    while len(cosine) and cosine.min() < SPIKE_COSINE:
+        tip = int(np.argmin(cosine))
+        tips.append(tip + HAIRPIN)
+        cosine[max(tip - HAIRPIN, 0) : tip + HAIRPIN + 1] = 1.0
+    return sorted(tips)
 
 
 def tidy(points: Float) -> Integer:

@@ -1,0 +1,192 @@
+"""Pieces of one line put together: ends that run into each other, unless what lies between was looked at and bare.
+
+A detector that always ends a line at the same place, or two tracks of one line that never were one, leave two lines in
+the map where the road has one. They are joined here, when the map is made, so that the evidence stays as it was seen
+and the order of frames does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapfusion.config import IntegratorConfig
+from mapfusion.elements import MapElement
+from mapfusion.geometry import arc_length
+from mapfusion.views import ViewGrid
+
+Float = NDArray[np.float64]
+End = tuple[int, int]
+"""Which element, and 0 for its start or -1 for its end."""
+
+DIRECTION_LENGTH = 4.0
+"""The direction of an end is that of the last so many metres."""
+
+SHORTEST_LOOP = 8.0
+"""A shorter line is not led back to its own start, metres."""
+
+
+@dataclass(frozen=True)
+class _Link:
+    """Two ends that may be one line.
+
+    Attributes:
+        cost: metres apart, and more where they do not point at each other; the least comes first.
+        ends: of the two elements.
+        overlap: how far the second one reaches back beside the first, metres.
+    """
+
+    cost: float
+    ends: tuple[End, End]
+    overlap: float
+
+
+def join(elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
+    """Join the lines that go on in each other; crossings and closed lines stay as they are.
+
+    Args:
+        elements: of one map, metres.
+        views: where the car has looked.
+        config: how far apart, and how well in line, ends must be.
+
+    Returns:
+        The elements, in the order of the first piece of each.
+    """
+    open_ends: list[End] = [
+        (number, end)
+        for number, element in enumerate(elements)
+        if not element.kind.is_ring and (element.points[0] != element.points[-1]).any()
+        for end in (0, -1)
+    ]
+    if len(open_ends) < 2:
+        return list(elements)
+    tips = np.array([elements[number].points[end] for number, end in open_ends])
+    outward = np.array([_direction(elements[number].points, end) for number, end in open_ends])
+    links = []
+    for first, second in cKDTree(tips).query_pairs(config.join_gap, output_type="ndarray").tolist():
+        link = _link(elements, open_ends[first], open_ends[second], outward[first], outward[second], views, config)
+        if link is not None:
+            links.append(link)
+    if not links:
+        return list(elements)
+    return _chained(list(elements), sorted(links, key=lambda link: (link.cost, link.ends)))
+
+
+def _direction(points: Float, end: int) -> Float:
+    """Return the unit direction that leads out of an end."""
+    line = points if end == -1 else points[::-1]
+    distance = arc_length(line)
+    back = max(distance[-1] - DIRECTION_LENGTH, 0.0)
+    inner = np.array([np.interp(back, distance, line[:, axis]) for axis in range(2)])
+    step = line[-1] - inner
+    return np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
+
+
+def _link(
+    elements: Sequence[MapElement],
+    first: End,
+    second: End,
+    out: Float,
+    other_out: Float,
+    views: ViewGrid,
+    config: IntegratorConfig,
+) -> _Link | None:
+    """Return how well two ends go on in each other, or None if they do not."""
+    one, two = elements[first[0]], elements[second[0]]
+    if one.kind is not two.kind or (first[0] == second[0] and one.length < SHORTEST_LOOP):
+        return None
+    straight = np.cos(np.radians(config.join_angle))
+    if -(out @ other_out) < straight:
+        return None
+    start, stop = one.points[first[1]], two.points[second[1]]
+    axis = out - other_out
+    axis /= np.linalg.norm(axis)
+    gap = stop - start
+    along = float(gap @ axis)
+    aside = float(np.linalg.norm(gap - along * axis))
+    if along < -config.join_overlap or aside > config.join_aside * (1.0 + max(along, 0.0) / config.join_gap):
+        return None
+    if along > config.max_gap:
+        between = start + np.linspace(0.0, 1.0, max(int(along), 2) + 1)[1:-1, None] * gap
+        if float(np.median(views.at(between))) > config.join_views:
+            return None
+    if first[0] == second[0] and along < 0.0:
+        return None
+    return _Link(abs(along) + 2.0 * aside, (first, second), max(-along, 0.0))
+
+
+def _chained(elements: list[MapElement], links: Sequence[_Link]) -> list[MapElement]:
+    """Join along links, each end once, the best first."""
+    at: dict[End, End] = {(number, end): (number, end) for number in range(len(elements)) for end in (0, -1)}
+    parts: dict[int, MapElement] = dict(enumerate(elements))
+    for link in links:
+        first, second = link.ends
+        if first not in at or second not in at:
+            continue
+        (one, end), (two, start) = at.pop(first), at.pop(second)
+        if one == two:
+            parts[one] = _closed(parts[one])
+            continue
+        before = parts[one] if end == -1 else _reversed(parts[one])
+        after = parts[two] if start == 0 else _reversed(parts[two])
+        keep, drop = min(one, two), max(one, two)
+        joined = _joined(before, after, link.overlap)
+        del parts[drop]
+        parts[keep] = joined
+        for key, (part, other_end) in list(at.items()):
+            if part == one and other_end != end:
+                at[key] = (keep, 0)
+            elif part == two and other_end != start:
+                at[key] = (keep, -1)
+    return [parts[number] for number in sorted(parts)]
+
+
+def _reversed(element: MapElement) -> MapElement:
+    deviation = element.deviation
+    return replace(element, points=element.points[::-1], deviation=None if deviation is None else deviation[::-1])
+
+
+def _closed(element: MapElement) -> MapElement:
+    deviation = element.deviation
+    return replace(
+        element,
+        points=np.vstack([element.points, element.points[:1]]),
+        deviation=None if deviation is None else np.append(deviation, deviation[0]),
+    )
+
+
+def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement:
+    """Put two elements end to end; where they overlap, each gives up half."""
+    one, one_deviation = _cut_back(_reversed(before), overlap / 2)
+    two, two_deviation = _cut_back(after, overlap / 2)
+    share = before.length / max(before.length + after.length, 1e-9)
+    return replace(
+        before,
+        points=np.concatenate([one[::-1], two]),
+        deviation=None
+        if one_deviation is None or two_deviation is None
+        else np.concatenate([one_deviation[::-1], two_deviation]),
+        confidence=share * before.confidence + (1.0 - share) * after.confidence,
+        # frames that saw both are counted in either, so that the sum would count them twice
+        observations=max(before.observations, after.observations),
+        first_seen=min(before.first_seen, after.first_seen),
+        last_seen=max(before.last_seen, after.last_seen),
+        track_ids=tuple(sorted({*before.track_ids, *after.track_ids})),
+    )
+
+
+def _cut_back(element: MapElement, length: float) -> tuple[Float, Float | None]:
+    """Return points and deviations without the first so many metres, but at least the last segment."""
+    points, deviation = element.points, element.deviation
+    distance = arc_length(points)
+    length = min(length, 0.9 * float(distance[-1]))
+    if length <= 0.0:
+        return points, deviation
+    rest = distance > length
+    start = [np.interp(length, distance, points[:, axis]) for axis in range(2)]
+    cut = np.vstack([start, points[rest]])
+    return cut, None if deviation is None else np.append(np.interp(length, distance, deviation), deviation[rest])
