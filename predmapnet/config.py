@@ -198,7 +198,7 @@ class RevivalConfig(Section):
 
     Attributes:
         enabled: switch.
-        frames: k; how many frames a track may be missing and still get its id back.
+        frames: k; how many frames a track may go unseen and still get its id back.
         distance: chamfer distance in metres of a lost track and a newborn one, where both could be seen.
         capacity: lost tracks remembered per stream; those that are missing for longest make room.
     """

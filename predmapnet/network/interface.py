@@ -57,15 +57,15 @@ class Instances:
 
 @dataclass
 class LostTracks:
-    """Tracks that ended a while ago and may come back (:mod:`predmapnet.network.revival`). Rows are padded.
+    """Tracks that were not seen lately and may come back (:mod:`predmapnet.network.revival`). Rows are padded.
 
-    ``L`` is the number of rows; everything is as of the last frame in which the track lived.
+    ``L`` is the number of rows; everything is as of the last frame in which the track was seen.
 
     Attributes:
         valid: ``(B, L) bool``.
         track_ids: ``(B, L) int64``.
         labels: ``(B, L) int64``.
-        missing: ``(B, L) int64``, frames in which the track did not live, before the present one.
+        missing: ``(B, L) int64``, frames in which the track was not seen, before the present one.
         ego_to_global: ``(B, L, 4, 4) float64``.
         history_maps: ``(B, L, H_m, W_m)``.
         point_history: ``(B, L, n, P, 2)``.

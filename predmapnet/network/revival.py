@@ -1,8 +1,10 @@
 """Lost tracks that come back, which the paper lists among what it lacks.
 
-A track that ended (its score stayed low, or it left the ROI) keeps its memory for k frames. A newborn detection of its
-class that lies where it was takes its id, history map and polylines back. Nothing is computed for lost tracks while
-they are lost: they keep the pose of the last frame in which they lived, and one step brings them to the present.
+A track is lost from its first frame without support on, be it that its score is low or that it left the ROI. Whether
+it still lives on unsupported or has ended makes no difference: an unsupported polyline soon strays from its line. A
+newborn detection of its class that lies where it was last seen, at most k frames ago, takes its id, history map and
+polylines back. Nothing is computed for lost tracks while they are lost: they keep the pose of the frame in which they
+were last seen, and one step brings them to the present.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ def revive(
         config: of the network.
 
     Returns:
-        The instances, with the ids of the lost tracks that came back; and all lost tracks, those included.
+        The instances, with the ids of the lost tracks that came back, each once; and all lost tracks, those included.
     """
     lost = _lost_tracks(instances, state, repeats, config.revival)
     newborn = instances.valid & (instances.track_ids >= state.next_track_id[:, None])
@@ -56,7 +58,11 @@ def revive(
     distances[candidates.unbind(dim=1)] = _distances(candidates, lost, instances.points, ego_to_global, config.roi)
     pairs = _closest_pairs(distances.masked_fill(distances >= config.revival.distance, torch.inf))
     former_ids = lost.track_ids.gather(1, pairs.long().argmax(dim=1))
-    return replace(instances, track_ids=torch.where(pairs.any(dim=1), former_ids, instances.track_ids)), lost
+    found = pairs.any(dim=1)
+    # What lived on under that id without support makes way.
+    replaced = _shares_id(instances.track_ids, former_ids, found)
+    ids = torch.where(found, former_ids, instances.track_ids.masked_fill(replaced, -1))
+    return replace(instances, valid=instances.valid & ~replaced, track_ids=ids), lost
 
 
 def recall(
@@ -95,18 +101,17 @@ def recall(
 
 
 def still_lost(lost: LostTracks, instances: Instances) -> LostTracks:
-    """Return the lost tracks without those that live again."""
-    lives = (lost.track_ids[:, :, None] == instances.track_ids[:, None]) & instances.valid[:, None]
-    return replace(lost, valid=lost.valid & ~lives.any(dim=2))
+    """Return the lost tracks without those that are seen again."""
+    return replace(lost, valid=lost.valid & ~_shares_id(lost.track_ids, instances.track_ids, _supported(instances)))
 
 
 def _lost_tracks(instances: Instances, state: StreamState, repeats: Tensor, rules: RevivalConfig) -> LostTracks:
-    """Put the tracks that end in this frame before those that were lost already, and let the oldest ones go."""
+    """Put the tracks that get lost in this frame before those that were lost already, and let the oldest ones go."""
     tracks, histories = state.instances, state.point_history.shape[2]
-    lives = (tracks.track_ids[:, :, None] == instances.track_ids[:, None]) & instances.valid[:, None]
+    seen = _shares_id(tracks.track_ids, instances.track_ids, _supported(instances))
     pose = state.ego_to_global[:, None]
-    ended = LostTracks(
-        valid=tracks.valid & ~lives.any(dim=2) & ~repeats,
+    now = LostTracks(
+        valid=_supported(tracks) & ~seen & ~repeats,
         track_ids=tracks.track_ids,
         labels=tracks.labels,
         missing=torch.zeros_like(tracks.track_ids),
@@ -117,18 +122,28 @@ def _lost_tracks(instances: Instances, state: StreamState, repeats: Tensor, rule
         recent_poses=pose.expand(-1, histories, -1, -1),
     )
     if state.lost is None:
-        return ended
+        return now
     missing = state.lost.missing + 1
-    before = replace(state.lost, missing=missing, valid=state.lost.valid & (missing <= rules.frames))
-    valid = torch.cat([ended.valid, before.valid], dim=1)
+    gone = _shares_id(state.lost.track_ids, tracks.track_ids, repeats)
+    before = replace(state.lost, missing=missing, valid=state.lost.valid & (missing <= rules.frames) & ~gone)
+    valid = torch.cat([now.valid, before.valid], dim=1)
     order = (~valid).long().argsort(dim=1, stable=True)[:, : rules.capacity]
     stream = torch.arange(len(order), device=order.device)[:, None]
     rows = {
         name: torch.cat([value, getattr(before, name)], dim=1)[stream, order]
-        for name, value in vars(ended).items()
+        for name, value in vars(now).items()
         if name != "recent_poses"
     }
     return LostTracks(**rows, recent_poses=torch.cat([before.recent_poses[:, 1:], pose], dim=1))
+
+
+def _supported(instances: Instances) -> Tensor:
+    return instances.valid & (instances.misses == 0)
+
+
+def _shares_id(ids: Tensor, others: Tensor, counted: Tensor) -> Tensor:
+    """Tell which ids ``(B, n)`` are among others ``(B, m)`` that are ``counted``."""
+    return ((ids[:, :, None] == others[:, None]) & counted[:, None]).any(dim=2)
 
 
 def _distances(pairs: Tensor, lost: LostTracks, points: Tensor, ego_to_global: Tensor, roi: RegionOfInterest) -> Tensor:

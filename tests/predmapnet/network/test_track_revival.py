@@ -57,7 +57,9 @@ class Drive:
             if self.state.lost is not None:
                 kept = self.state.lost
                 waiting = kept.track_ids[stream][kept.valid[stream]].tolist()
-                assert len(set(waiting)) == len(waiting) and not set(waiting) & set(alive)
+                assert len(set(waiting)) == len(waiting)
+                sure = tracks.valid[stream] & (tracks.misses[stream] == 0)
+                assert not set(waiting) & set(tracks.track_ids[stream][sure].tolist())
         rows = tracks.queries[..., 0].long().tolist()
         found = [dict(zip(row, ids, strict=True)) for row, ids in zip(rows, tracks.track_ids.tolist(), strict=True)]
         return [[found[stream].get(row) for row in range(len(lines))] for stream, lines in enumerate(seen)]
@@ -112,10 +114,21 @@ def test_a_hidden_line_gets_its_id_back_within_k_frames(drive, missing, back):
 def test_with_merging_too_and_after_the_misses_that_are_allowed(drive):
     stream = drive(tracking={"merge": True, "misses_allowed": 2})
     stream.step(ONE)
-    for _ in range(5):
+    for _ in range(4):
         stream.step([])
     assert not stream.state.instances.valid.any()
     assert stream.step(ONE) == [[0]]
+
+
+def test_a_track_that_strays_unsupported_loses_its_id_to_the_line_that_it_strayed_from(drive):
+    stream = drive(tracking={"merge": True, "misses_allowed": 3})
+    stream.step(ONE)
+    stream.step([])
+    strayed = stream.state.instances.points + torch.tensor([0.0, 0.2])
+    stream.state = replace(stream.state, instances=replace(stream.state.instances, points=strayed))
+    assert stream.step(ONE) == [[0]]
+    assert stream.selection.instances.valid.sum() == 1
+    assert not stream.state.lost.valid.any()
 
 
 def test_another_class_or_another_place_gets_a_new_id(drive):
