@@ -89,7 +89,7 @@ def candidates(
         local.directions,
         local.owner,
         curve,
-        tangents(curve),
+        observation.directions,
         reach=1.5 * config.match_distance,
         angle=config.match_angle,
         end=0.6 * config.station_spacing,

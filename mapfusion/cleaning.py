@@ -11,11 +11,13 @@ from scipy.linalg import solveh_banded
 from scipy.special import expit
 
 from mapfusion.config import IntegratorConfig
+from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
-from mapfusion.lines import Curve, Evidence, FusedLine
+from mapfusion.lines import Evidence, FusedLine
 from mapfusion.rings import FusedRing
 from mapfusion.tidy import closes, hairpins, tidy
+from mapfusion.uncertainty import line_deviations, ring_deviations
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
@@ -30,8 +32,8 @@ def log_odds(seen: Float, missed: Float, config: IntegratorConfig) -> Float:
     return np.clip(odds, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
 
 
-def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
-    """Return the stretches of a line that have evidence enough, as elements."""
+def line_elements(line: FusedLine, views: ViewGrid, parts: Float, config: IntegratorConfig) -> list[MapElement]:
+    """Return the stretches of a line that have evidence enough, as elements; ``parts`` of the detector's error."""
     curve = line.curve
     if line.evidence.observations < config.min_observations:
         return []
@@ -39,6 +41,7 @@ def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) ->
     odds = log_odds(curve.seen, missed, config)
     alive = _supported(odds, config.weak_log_odds) & (curve.information > 1.0 / config.max_deviation**2)
     points = smooth(curve, config)
+    deviation = line_deviations(curve, parts)
     elements = []
     stretches = _stretches(alive, int(config.max_gap / config.station_spacing))
     for start, stop in (part for stretch in stretches for part in _unfolded(points, *stretch)):
@@ -48,13 +51,13 @@ def line_elements(line: FusedLine, views: ViewGrid, config: IntegratorConfig) ->
         if closes(points[rows]):
             rows = np.append(rows, rows[0])
         part, kept = _simplify(points[rows], config.simplify_tolerance)
-        deviation = 1.0 / np.sqrt(curve.information[rows][kept])
-        elements.append(_element(line.kind, part, float(expit(odds[start:stop]).mean()), line.evidence, deviation))
+        sure = float(expit(odds[start:stop]).mean())
+        elements.append(_element(line.kind, part, sure, line.evidence, deviation[rows][kept]))
     return elements
 
 
-def ring_elements(ring: FusedRing, views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
-    """Return a crossing as an element, or nothing where the evidence is too little."""
+def ring_elements(ring: FusedRing, views: ViewGrid, parts: Float, config: IntegratorConfig) -> list[MapElement]:
+    """Return a crossing as an element, or nothing where the evidence is too little; ``parts`` of the error."""
     if ring.evidence.observations < config.min_observations:
         return []
     held = np.argwhere(ring.level() > 0)
@@ -70,7 +73,7 @@ def ring_elements(ring: FusedRing, views: ViewGrid, config: IntegratorConfig) ->
     points = shapely.get_coordinates(shapely.orient_polygons(shapely.simplify(outline, config.simplify_tolerance)))
     cells = np.floor(points / config.ring_cell).astype(np.int64) - ring.corner
     looked = ring.looked[cells[:, 0].clip(0, ring.looked.shape[0] - 1), cells[:, 1].clip(0, ring.looked.shape[1] - 1)]
-    deviation = 1.0 / np.sqrt(np.maximum(looked.astype(np.float64), 1e-2))
+    deviation = ring_deviations(ring, looked.astype(np.float64), parts)
     return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation)]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from mapfusion.association import Candidate, assign, candidates, gather
 from mapfusion.cleaning import line_elements, ring_elements
 from mapfusion.config import IntegratorConfig
+from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
 from mapfusion.joining import join
 from mapfusion.journal import Journal
-from mapfusion.lines import Curve, Evidence, FusedLine, beside, fuse
-from mapfusion.matching import Correspondence
-from mapfusion.observations import Observation, observe, pose_problem
+from mapfusion.lines import Evidence, FusedLine, beside, fuse
+from mapfusion.observations import Observation, Track, observe, pose_problem
 from mapfusion.rings import (
     FusedRing,
     RingSighting,
@@ -32,10 +32,15 @@ from mapfusion.rings import (
 )
 from mapfusion.spatial import TileIndex
 from mapfusion.state import load_state, save_state
+from mapfusion.uncertainty import PRIOR_SHARES, PROBE_SPACING, ErrorModel
 from mapfusion.views import ViewGrid, clearly_visible
 from mapfusion.visibility import ground_problem
 
 Float = NDArray[np.float64]
+
+
+STALE = 0.1
+"""The uncertainty of the whole map is computed anew when what is known of the detector's error changed by more."""
 
 
 class MapIntegrator:
@@ -64,6 +69,8 @@ class MapIntegrator:
         self.index = TileIndex()
         self.next_id = 0
         self.frames = 0
+        self.errors = ErrorModel()
+        self._parts = PRIOR_SHARES
         self._clean: dict[int, list[MapElement]] = {}
         self._dirty: set[int] = set()
 
@@ -78,34 +85,39 @@ class MapIntegrator:
             log: name of the drive; poses are checked against other frames of the same drive only, and equal track
                 ids of two drives are two tracks.
         """
+        car = frame_map.ego_to_global[:2, 3]
         problem = (
             pose_problem(frame_map.ego_to_global)
             or ground_problem(frame_map)
-            or self.journal.enter(log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed)
+            or self.journal.enter(log, frame_map.timestamp, car, self.config.max_speed)
         )
         if problem is not None:
             self.rejections[problem] += 1
             return
         visible = clearly_visible(frame_map)
-        lines, rings = observe(frame_map, self.config, self.rejections, log, visible)
+        lines, rings = observe(frame_map, self.config, self.rejections, self.journal.book(log).number, visible)
         self.frames += 1
         self.views.add(frame_map.ego_to_global, frame_map.roi, visible)
         reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + 2.0
-        low, high = frame_map.ego_to_global[:2, 3] - reach, frame_map.ego_to_global[:2, 3] + reach
-        near = self.index.near(low, high)
+        instant = _Instant(frame_map.timestamp, (float(car[0]), float(car[1])), car - reach, car + reach)
+        near = self.index.near(instant.low, instant.high)
         self._dirty.update(near)
         for kind in (ElementKind.DIVIDER, ElementKind.BOUNDARY):
             known = {i: self.lines[i] for i in near if i in self.lines and self.lines[i].kind is kind}
-            self._add_lines([o for o in lines if o.kind is kind], known, low, high, frame_map.timestamp)
+            self._add_lines([o for o in lines if o.kind is kind], known, instant)
         self._add_rings(rings, [i for i in near if i in self.rings], frame_map, visible)
 
     def map(self) -> GlobalMap:
         """Return the map as it stands; only what changed since the last call is computed."""
+        parts = self.errors.parts()
+        if np.abs(parts - self._parts).sum() > STALE * self._parts.sum():
+            self._parts = parts
+            self._dirty.update(self.lines, self.rings)
         for element in self._dirty:
             if element in self.lines:
-                self._clean[element] = line_elements(self.lines[element], self.views, self.config)
+                self._clean[element] = line_elements(self.lines[element], self.views, self._parts, self.config)
             elif element in self.rings:
-                self._clean[element] = ring_elements(self.rings[element], self.views, self.config)
+                self._clean[element] = ring_elements(self.rings[element], self.views, self._parts, self.config)
             else:
                 self._clean.pop(element, None)
         self._dirty.clear()
@@ -136,72 +148,65 @@ class MapIntegrator:
         self.rings[element] = ring
         self._file_ring(element)
 
-    def _add_lines(
-        self, observations: list[Observation], known: dict[int, FusedLine], low: Float, high: Float, timestamp: int
-    ) -> None:
+    def _add_lines(self, observations: list[Observation], known: dict[int, FusedLine], instant: _Instant) -> None:
+        """Fuse the lines of one kind: each into the element it belongs to, what is left over becomes new ones."""
         if not observations:
             return
-        local = gather(known, low, high)
+        local = gather(known, instant.low, instant.high)
         options: list[list[Candidate]] = [
-            candidates(observation, known, local, low, self.config) if local is not None else []
+            candidates(observation, known, local, instant.low, self.config) if local is not None else []
             for observation in observations
         ]
-        chosen = assign([{c.element: c.benefit for c in row} for row in options])
-        taken: dict[int, set[int]] = {}
+        matching = _Matching(options, assign([{c.element: c.benefit for c in row} for row in options]))
         leftovers: list[tuple[Observation, Curve]] = []
-        touched: set[int] = set()
         merges: list[tuple[int, int]] = []
-        order = sorted(range(len(observations)), key=lambda i: chosen[i] is None)
-        for i in order:
-            own = [c for c in options[i] if c.element == chosen[i]]
-            if not own:
-                own = [c for c in options[i] if _mostly_free(c, taken)][:1]
-            if not own:
-                leftovers.append((observations[i], _curve(observations[i])))
+        for i in matching.order():
+            candidate = matching.take(i)
+            if candidate is None:
+                leftovers.append((observations[i], observations[i].curve))
                 continue
-            candidate = own[0]
-            for other in options[i]:
-                if other.element == candidate.element:
-                    continue
-                if other.element in chosen and not _mostly_free(other, taken):
-                    _note_beside(self.lines, candidate.element, other.element)
-                else:
-                    merges.append((candidate.element, other.element))
-            taken.setdefault(candidate.element, set()).update(candidate.match.station.tolist())
-            if candidate.element in touched:
-                # the stations have moved since; match again
-                match = beside(
-                    self.lines[candidate.element].curve,
-                    _curve(observations[i]),
-                    1.5 * self.config.match_distance,
-                    self.config.match_angle,
-                )
-                if not len(match.station):
-                    continue
-            else:
-                match = candidate.match
-            pieces = self._fuse_line(candidate.element, observations[i], match, timestamp, candidate.element in touched)
-            touched.add(candidate.element)
+            beside_it, twins = matching.others(i, candidate)
+            for other in beside_it:
+                _note_beside(self.lines, candidate.element, other)
+            merges.extend((candidate.element, other) for other in twins)
+            pieces = self._fuse_line(candidate, observations[i], instant, matching.first_time(candidate.element))
             leftovers.extend((observations[i], piece) for piece in pieces)
         for observation, piece in leftovers:
             if len(piece) >= 3:
-                self._new_line(observation, piece, timestamp)
+                self._new_line(observation, piece, instant.timestamp)
         for first, second in merges:
             self._merge_lines(first, second)
 
-    def _fuse_line(
-        self, element: int, observation: Observation, match: Correspondence, timestamp: int, again: bool
-    ) -> list[Curve]:
-        line = self.lines[element]
-        line.curve, pieces = fuse(line.curve, _curve(observation), match)
-        line.evidence.sighted(observation.track, timestamp, again)
-        self.index.put(element, line.curve.points)
-        self._dirty.add(element)
+    def _fuse_line(self, candidate: Candidate, observation: Observation, instant: _Instant, first: bool) -> list[Curve]:
+        """Fuse an observation into a line; ``first`` of this frame. Returns what leaves the line sideways."""
+        line, curve, match = self.lines[candidate.element], observation.curve, candidate.match
+        if not first:
+            # the stations have moved since; match again
+            match = beside(line.curve, curve, 1.5 * self.config.match_distance, self.config.match_angle)
+            if not len(match.station):
+                return []
+        probes = np.flatnonzero((line.first + match.station) % PROBE_SPACING == 0)
+        if len(probes):
+            station, vertex = match.station[probes], match.vertex[probes]
+            self.errors.note(
+                candidate.element,
+                line.first + station,
+                line.curve.points[station] + match.offset[probes],
+                observation.directions[vertex],
+                curve.information[vertex],
+                (*instant.car, _number(observation.track)),
+            )
+        length = len(line.curve)
+        pieces = fuse(line, curve, match)
+        line.evidence.sighted(observation.track, instant.timestamp, not first)
+        if len(line.curve) > length:
+            self.index.put(candidate.element, line.curve.points)
+        self._dirty.add(candidate.element)
         return pieces
 
     def _new_line(self, observation: Observation, curve: Curve, timestamp: int) -> None:
         evidence = Evidence(timestamp, timestamp, tracks={observation.track: 1})
-        self.put_line(self.next_id, FusedLine(observation.kind, curve, evidence))
+        self.put_line(self.next_id, FusedLine(observation.kind, curve.copy(), evidence))
         self.next_id += 1
 
     def _merge_lines(self, first: int, second: int) -> None:
@@ -216,7 +221,7 @@ class MapIntegrator:
         match = beside(base.curve, other.curve, self.config.match_distance, self.config.match_angle)
         if len(match.station) < 2 or match.distance.mean() > self.config.merge_distance:
             return
-        base.curve, pieces = fuse(base.curve, other.curve, match)
+        pieces = fuse(base, other.curve, match)
         base.evidence.absorb(other.evidence)
         self._dirty.update((keep, drop))
         self.index.put(keep, base.curve.points)
@@ -230,7 +235,7 @@ class MapIntegrator:
                     other.evidence.observations,
                     dict(other.evidence.tracks),
                 )
-                self.put_line(self.next_id, FusedLine(other.kind, piece, evidence))
+                self.put_line(self.next_id, FusedLine(other.kind, piece.copy(), evidence))
                 self.next_id += 1
 
     def _add_rings(
@@ -285,14 +290,66 @@ class MapIntegrator:
         self._dirty.add(element)
 
 
-def _curve(observation: Observation) -> Curve:
-    count = len(observation.points)
-    return Curve(observation.points, observation.information, np.full(count, observation.sighting), observation.view)
+@dataclass(frozen=True)
+class _Instant:
+    """When and where a frame was taken: nanoseconds, the car's position and the box that was looked at, metres."""
+
+    timestamp: int
+    car: tuple[float, float]
+    low: Float
+    high: Float
 
 
-def _mostly_free(candidate: Candidate, taken: dict[int, set[int]]) -> bool:
-    stations = taken.get(candidate.element)
-    return stations is None or len(stations.intersection(candidate.match.station.tolist())) < 0.3 * candidate.overlap
+class _Matching:
+    """Which line of the map each observation of a frame goes to, and which stretches of it are taken by then."""
+
+    def __init__(self, options: list[list[Candidate]], chosen: list[int | None]) -> None:
+        self.options = options
+        self.chosen = chosen
+        self.taken: dict[int, set[int]] = {}
+        self.touched: set[int] = set()
+
+    def order(self) -> list[int]:
+        """Return the observations, those that have an element of their own first."""
+        return sorted(range(len(self.options)), key=lambda i: self.chosen[i] is None)
+
+    def take(self, i: int) -> Candidate | None:
+        """Return where an observation goes: its own element, or else the first that is free there."""
+        options = self.options[i]
+        own = [c for c in options if c.element == self.chosen[i]] or [c for c in options if self.free(c)][:1]
+        return own[0] if own else None
+
+    def others(self, i: int, candidate: Candidate) -> tuple[list[int], list[int]]:
+        """Return the other elements that the observation lies beside: those that the frame shows, too, and the rest.
+
+        The candidate's stretch counts as taken from then on.
+        """
+        shown: list[int] = []
+        twins: list[int] = []
+        for other in self.options[i]:
+            if other.element != candidate.element:
+                seen_too = other.element in self.chosen and not self.free(other)
+                (shown if seen_too else twins).append(other.element)
+        self.taken.setdefault(candidate.element, set()).update(candidate.match.station.tolist())
+        return shown, twins
+
+    def free(self, candidate: Candidate) -> bool:
+        """Whether little of a candidate's stretch is taken."""
+        stations = self.taken.get(candidate.element)
+        if stations is None:
+            return True
+        return len(stations.intersection(candidate.match.station.tolist())) < 0.3 * candidate.overlap
+
+    def first_time(self, element: int) -> bool:
+        """Whether nothing was fused into an element before; from then on something was."""
+        first = element not in self.touched
+        self.touched.add(element)
+        return first
+
+
+def _number(track: Track) -> float:
+    """Return one number for a track of a log."""
+    return float(track[1] + (track[0] << 40))
 
 
 def _note_beside(lines: dict[int, FusedLine], first: int, second: int) -> None:

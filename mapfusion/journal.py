@@ -22,6 +22,7 @@ NEIGHBOURS = 3
 class LogBook:
     """The frames of one log in the order of time: nanoseconds, metres, and whether each was believed."""
 
+    number: int
     times: list[int] = field(default_factory=list)
     positions: list[tuple[float, float]] = field(default_factory=list)
     believed: list[bool] = field(default_factory=list)
@@ -32,6 +33,12 @@ class Journal:
 
     def __init__(self) -> None:
         self.logs: dict[str, LogBook] = {}
+
+    def book(self, log: str) -> LogBook:
+        """Return what is known of a log; logs are numbered as they appear."""
+        if log not in self.logs:
+            self.logs[log] = LogBook(len(self.logs))
+        return self.logs[log]
 
     def enter(self, log: str, timestamp: int, position: Float, max_speed: float) -> str | None:
         """Note a frame and say whether it repeats one, or whether the car can hardly have been there.
@@ -49,7 +56,7 @@ class Journal:
         Returns:
             What is wrong with the frame, or None.
         """
-        book = self.logs.setdefault(log, LogBook())
+        book = self.book(log)
         place = bisect_left(book.times, timestamp)
         if place < len(book.times) and book.times[place] == timestamp:
             return "frame repeated"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.curve import INFORMATION, SCATTER, Curve
 from mapfusion.elements import ElementKind
 from mapfusion.matching import Correspondence, correspond, tangents
 from mapfusion.observations import Track
@@ -15,6 +17,8 @@ Float = NDArray[np.float64]
 
 BLEND_LENGTH = 10.0
 """Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
+
+ONES = np.ones(2)
 
 
 @dataclass
@@ -48,100 +52,79 @@ class Evidence:
 
 
 @dataclass
-class Curve:
-    """Stations along a line, about one spacing apart; arrays of equal length.
+class FusedLine:
+    """A divider or boundary of the map.
 
     Attributes:
-        points: ``(n, 2) float64``, metres, global frame.
-        information: ``(n,) float64``, inverse variance across the line, 1 / m².
-        seen: ``(n,) float64``, sum of sightings, weighted by score.
-        seen_view: ``(n,) float64``, sum of the view weights of those sightings.
+        kind: what it is.
+        curve: its stations.
+        evidence: what is known of it as a whole.
+        first: number of the first station; numbers stay with the stations when the line grows at its start.
     """
-
-    points: Float
-    information: Float
-    seen: Float
-    seen_view: Float
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def part(self, start: int, stop: int) -> Curve:
-        """Return stations ``start`` to ``stop`` (excluded)."""
-        piece = slice(start, stop)
-        return Curve(self.points[piece], self.information[piece], self.seen[piece], self.seen_view[piece])
-
-    def reversed(self) -> Curve:
-        """Return the curve with its stations in the opposite order."""
-        return Curve(self.points[::-1], self.information[::-1], self.seen[::-1], self.seen_view[::-1])
-
-    @staticmethod
-    def join(parts: list[Curve]) -> Curve:
-        """Put curves end to end."""
-        return Curve(
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.information for part in parts]),
-            np.concatenate([part.seen for part in parts]),
-            np.concatenate([part.seen_view for part in parts]),
-        )
-
-
-@dataclass
-class FusedLine:
-    """A divider or boundary of the map."""
 
     kind: ElementKind
     curve: Curve
     evidence: Evidence
+    first: int = 0
 
 
-def fuse(base: Curve, new: Curve, match: Correspondence) -> tuple[Curve, list[Curve]]:
-    """Fuse a curve into another that it lies beside.
+def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
+    """Fuse a curve into a line that it lies beside, in place.
 
     Where both lie side by side, each station moves across the line to the mean weighted by information. Where the
-    new curve goes on past an end of the base, the base is extended, led over smoothly from the fused stretch.
+    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch.
 
     Args:
-        base: the curve of the map.
-        new: an observation, or another curve of the map.
-        match: stations of ``base`` (at least one) beside vertices of ``new``.
+        line: of the map.
+        new: an observation, or the curve of another line of the map.
+        match: stations of the line (at least one) beside vertices of ``new``.
 
     Returns:
-        The fused curve, and the parts of ``new`` that leave the base sideways and must be something else.
+        The parts of ``new`` that leave the line sideways and must be something else.
     """
-    last = len(new) - 1
+    base, last = line.curve, len(new) - 1
     station, vertex, offset = match.station, match.vertex, match.offset
-    if match.same_way.mean() < 0.5:
+    if 2 * np.count_nonzero(match.same_way) < len(station):
         new = new.reversed()
         vertex = last - vertex
-    gain = new.information[vertex] / (base.information[station] + new.information[vertex])
-    points, information = base.points.copy(), base.information.copy()
-    seen, seen_view = base.seen.copy(), base.seen_view.copy()
-    points[station] += gain[:, None] * offset
-    information[station] += new.information[vertex]
-    seen[station] += new.seen[vertex]
-    seen_view[station] += new.seen_view[vertex]
-    fused = Curve(points, information, seen, seen_view)
+    head, tail = int(vertex.argmin()), int(vertex.argmax())
+    first_foot, last_foot = base.points[station[head]] + offset[head], base.points[station[tail]] + offset[tail]
+    gain = _average(base, new, match, vertex)
 
     leftovers: list[Curve] = []
-    parts = [fused]
-    head, tail = int(np.argmin(vertex)), int(np.argmax(vertex))
+    parts = [base]
     if vertex[head] > 0:
         before = new.part(0, int(vertex[head]))
         if station[head] <= 1:
             shift = -(1.0 - gain[head]) * offset[head]
-            extension = _extension(before.reversed(), base.points[station[head]] + offset[head], shift, points)
-            parts.insert(0, extension.reversed())
+            parts.insert(0, _extension(before.reversed(), first_foot, shift, base.points).reversed())
+            line.first -= len(parts[0])
         else:
             leftovers.append(before)
     if vertex[tail] < last:
         after = new.part(int(vertex[tail]) + 1, last + 1)
         if station[tail] >= len(base) - 2:
             shift = -(1.0 - gain[tail]) * offset[tail]
-            parts.append(_extension(after, base.points[station[tail]] + offset[tail], shift, points))
+            parts.append(_extension(after, last_foot, shift, base.points))
         else:
             leftovers.append(after)
-    return Curve.join(parts) if len(parts) > 1 else fused, leftovers
+    if any(len(part) for part in parts if part is not base):
+        line.curve = Curve.join(parts)
+    return leftovers
+
+
+def _average(base: Curve, new: Curve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
+    """Move stations to the weighted mean, in place; returns the new curve's share in it, ``(n,)``."""
+    station = match.station
+    added = new.sums[vertex]
+    known = base.sums[station, INFORMATION]
+    gain = added[:, INFORMATION] / (known + added[:, INFORMATION])
+    # scatter about the common mean of two groups (Chan, Golub and LeVeque, 1979)
+    added[:, SCATTER] += gain * known * match.distance**2
+    base.points[station] += gain[:, None] * match.offset
+    base.sums[station] += added
+    base.marks[station] |= new.marks[vertex]
+    return np.asarray(gain)
 
 
 def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
@@ -153,23 +136,32 @@ def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
         shift: ``(2,)``, from there to the fused end.
         base: ``(n, 2)`` stations of the base.
     """
-    away = np.linalg.norm(piece.points - foot, axis=1)
-    start = 0
-    # vertices beside the base's end rather than past it would fold the line back
-    at_start = np.sum((base[0] - foot) ** 2) < np.sum((base[-1] - foot) ** 2)
+    at_start = squared(base[0] - foot) < squared(base[-1] - foot)
     end = base[0] if at_start else base[-1]
     inner = base[min(2, len(base) - 1)] if at_start else base[max(len(base) - 3, 0)]
-    outward = (end - inner) / max(float(np.linalg.norm(end - inner)), 1e-9)
-    while start < min(3, len(piece)) and (piece.points[start] + shift - end) @ outward < 0.3:
-        start += 1
-    points = piece.points + np.exp(-away / BLEND_LENGTH)[:, None] * shift
+    outward = (end - inner) / max(math.sqrt(squared(end - inner)), 1e-9)
+    # vertices beside the base's end rather than past it would fold the line back
+    ahead = (piece.points[:3] + (shift - end)) @ outward >= 0.3
+    start = int(ahead.argmax()) if ahead.any() else len(ahead)
+    gap = piece.points - foot
+    away = np.sqrt((gap * gap) @ ONES)
+    points = piece.points + np.exp(away / -BLEND_LENGTH)[:, None] * shift
     stop = len(piece)
-    if len(base) > 24 and len(piece) > start:
+    if len(base) > 24 and stop > start:
         other_end = base[-12:] if at_start else base[:12]
-        near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
-        if near.any():
-            stop = max(int(np.argmax(near)), start)
-    return Curve(points[start:stop], piece.information[start:stop], piece.seen[start:stop], piece.seen_view[start:stop])
+        # a loop only if the piece comes anywhere near the other end
+        if (points.min(axis=0) < other_end.max(axis=0) + 0.6).all() and (
+            points.max(axis=0) > other_end.min(axis=0) - 0.6
+        ).all():
+            near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
+            if near.any():
+                stop = max(int(near.argmax()), start)
+    return Curve(points[start:stop], piece.sums[start:stop], piece.marks[start:stop])
+
+
+def squared(vector: Float) -> float:
+    """Return the squared length of a vector ``(2,)``."""
+    return float(vector[0] * vector[0] + vector[1] * vector[1])
 
 
 def beside(base: Curve, new: Curve, reach: float, angle: float) -> Correspondence:

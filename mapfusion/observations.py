@@ -11,14 +11,17 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.config import IntegratorConfig
+from mapfusion.curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, Curve
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from mapfusion.geometry import arc_length, transform_points
+from mapfusion.matching import tangents_of_all
+from mapfusion.uncertainty import place_mark, track_mark
 from mapfusion.views import view_weight
 
 Float = NDArray[np.float64]
 
-Track: TypeAlias = tuple[str, int]
-"""A track of a drive: name of the log, id within it. Different logs count their tracks from the same number."""
+Track: TypeAlias = tuple[int, int]
+"""A track of a drive: number of the log, id within it. Different logs count their tracks from the same number."""
 
 SURE_SCORE = 0.5
 """A detection with this score is a whole sighting."""
@@ -31,31 +34,26 @@ class Observation:
     Attributes:
         kind: what it is.
         track: its log and its id there.
-        score: in ``[0, 1]``.
-        points: ``(n, 2) float64``, metres, global frame; lines have vertices one station apart.
-        information: ``(n,) float64``, inverse variance across the line, 1 / m².
-        view: ``(n,) float64``, how much of a look at each vertex the sighting answers: the view weight, less below
-            :data:`SURE_SCORE`, where the element was in part missed (a track that coasts).
+        curve: its vertices in the global frame, of a line one station apart, with what the sighting says there. How
+            much of a look at each vertex it answers is the view weight, less below :data:`SURE_SCORE`, where the
+            element was in part missed (a track that coasts).
+        directions: ``(n, 2) float64``, unit, along the vertices.
     """
 
     kind: ElementKind
     track: Track
-    score: float
-    points: Float
-    information: Float
-    view: Float
+    curve: Curve
+    directions: Float
+
+    @property
+    def points(self) -> Float:
+        """``(n, 2) float64``, metres, global frame."""
+        return self.curve.points
 
     @property
     def sighting(self) -> float:
         """What the sighting counts for: 1 at :data:`SURE_SCORE`, in proportion to the score, at most 1.5."""
-        return min(self.score / SURE_SCORE, 1.5)
-
-    def part(self, start: int, stop: int) -> Observation:
-        """Return the observation of vertices ``start`` to ``stop`` (excluded)."""
-        piece = slice(start, stop)
-        return Observation(
-            self.kind, self.track, self.score, self.points[piece], self.information[piece], self.view[piece]
-        )
+        return float(self.curve.seen[0])
 
 
 def pose_problem(ego_to_global: Float) -> str | None:
@@ -75,7 +73,7 @@ def observe(
     frame_map: FrameMap,
     config: IntegratorConfig,
     rejections: Counter[str],
-    log: str = "",
+    log: int = 0,
     visible: shapely.Geometry | None = None,
 ) -> tuple[list[Observation], list[Observation]]:
     """Return the lines and the rings of a frame that can be fused.
@@ -84,7 +82,7 @@ def observe(
         frame_map: one instant; only tracked elements are used.
         config: spacing and error model.
         rejections: counted up by reason for every element that is left out.
-        log: name of the drive.
+        log: number of the drive.
         visible: what could be seen, ego frame; None for all of the ROI.
 
     Returns:
@@ -119,35 +117,57 @@ def _observations(
     rows: list[int],
     curves: list[Float],
     config: IntegratorConfig,
-    log: str,
+    log: int,
     visible: shapely.Geometry | None,
 ) -> list[Observation]:
     """Say where the points of curves of the ego frame lie and what they are worth, all at once."""
     if not rows:
         return []
     local = np.concatenate(curves)
-    ends = np.cumsum([len(curve) for curve in curves])
-    deviation = config.deviation_near + config.deviation_per_metre * np.sqrt((local**2).sum(axis=1))
+    sizes = [len(curve) for curve in curves]
+    ends = np.cumsum(sizes)
+    scores = np.asarray(frame_map.scores, dtype=np.float64)[rows]
+    deviation = config.deviation_near + config.deviation_per_metre * np.sqrt((local * local).sum(axis=1))
+    sums = np.zeros((len(local), 5))
+    sums[:, INFORMATION] = np.repeat(np.maximum(scores, 0.05), sizes) / deviation**2
+    sums[:, SEEN] = np.repeat(np.minimum(scores / SURE_SCORE, 1.5), sizes)
+    answered = np.repeat(np.minimum(scores / SURE_SCORE, 1.0), sizes)
+    sums[:, SEEN_VIEW] = answered * _looked_at(frame_map, rows, sizes, local, config, visible)
+    sums[:, OBSERVATIONS] = 1.0
+    marks = np.empty((len(local), 2), dtype=np.uint64)
+    marks[:, PLACES] = place_mark(log, frame_map.ego_to_global[:2, 3])
+    ids = frame_map.track_ids[rows].tolist()
+    marks[:, TRACKS] = np.repeat(np.array([track_mark(log, track) for track in ids], dtype=np.uint64), sizes)
     points = transform_points(frame_map.ego_to_global, local)
-    view = whole = view_weight(local, frame_map.roi, config)
-    if visible is not None:
-        view = view_weight(local, frame_map.roi, config, visible)
-    observations = []
-    for row, start, stop in zip(rows, [0, *ends[:-1].tolist()], ends.tolist(), strict=True):
-        score = float(frame_map.scores[row])
-        kind = ElementKind(int(frame_map.kinds[row]))
-        looked = whole if kind.is_ring else view  # what of a ring could not be seen is known by its cells
-        observations.append(
-            Observation(
-                kind=kind,
-                track=(log, int(frame_map.track_ids[row])),
-                score=score,
-                points=points[start:stop],
-                information=max(score, 0.05) / deviation[start:stop] ** 2,
-                view=looked[start:stop] * min(score / SURE_SCORE, 1.0),
-            )
+    directions = tangents_of_all(points, ends)
+    curve = Curve(points, sums, marks)
+    return [
+        Observation(
+            kind=ElementKind(kind),
+            track=(log, track),
+            curve=curve.part(start, stop),
+            directions=directions[start:stop],
         )
-    return observations
+        for kind, track, start, stop in zip(
+            frame_map.kinds[rows].tolist(), ids, [0, *ends[:-1].tolist()], ends.tolist(), strict=True
+        )
+    ]
+
+
+def _looked_at(
+    frame_map: FrameMap,
+    rows: list[int],
+    sizes: list[int],
+    local: Float,
+    config: IntegratorConfig,
+    visible: shapely.Geometry | None,
+) -> Float:
+    """Return the view weights of the points of all curves; what of a ring could not be seen is known by its cells."""
+    whole = view_weight(local, frame_map.roi, config)
+    if visible is None:
+        return whole
+    ring = np.repeat(frame_map.kinds[rows] == ElementKind.PED_CROSSING, sizes)
+    return np.where(ring, whole, view_weight(local, frame_map.roi, config, visible))
 
 
 def _element_problem(points: Float, kind: int, score: float, config: IntegratorConfig) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
@@ -18,10 +18,14 @@ from mapfusion.observations import Observation
 Float = NDArray[np.float64]
 Grid = NDArray[np.float32]
 Integer = NDArray[np.int64]
+Marks = NDArray[np.uint64]
 Window = tuple[slice, slice]
 
 TRUNCATION = 1.5
 """Signed distances are cut off here, so that one wrong ring moves the mean little, metres."""
+
+BESIDE = 0.5
+"""Cells this close to a crossing's outline tell how far an observed one lies from it, metres."""
 
 LOOSE_TOLERANCE = 1.5
 """Where a crossing goes on unseen, its outline is straight to within so many cells."""
@@ -46,6 +50,8 @@ class FusedRing:
         seen_view: sum of the view weights of the observations.
         seen: sum of sightings, weighted by score.
         evidence: times, tracks and counts.
+        scatter: sum of the observations' squared distances from the outline, times information.
+        marks: ``(2,) uint64``, bits for the places from which it was seen and for the tracks.
     """
 
     corner: Integer
@@ -54,6 +60,8 @@ class FusedRing:
     seen_view: Grid
     seen: float
     evidence: Evidence
+    scatter: float = 0.0
+    marks: Marks = field(default_factory=lambda: np.zeros(2, dtype=np.uint64))
     kind: ElementKind = ElementKind.PED_CROSSING
 
     @property
@@ -237,12 +245,24 @@ def fuse_ring(ring: FusedRing, sighting: RingSighting, timestamp: int) -> None:
     observation = sighting.observation
     ring.grow(sighting.corner, sighting.stop)
     window = ring.window(sighting.corner, sighting.stop)
-    information = sighting.visible * np.float32(observation.information.mean())
+    information = sighting.visible * np.float32(observation.curve.information.mean())
+    ring.scatter += _scatter(ring, window, information, sighting.distance)
+    ring.marks |= observation.curve.marks[0]
     ring.distance[window] += information * sighting.distance
     ring.looked[window] += information
-    ring.seen_view[window] += sighting.clear * np.float32(observation.view.mean())
+    ring.seen_view[window] += sighting.clear * np.float32(observation.curve.seen_view.mean())
     ring.seen += observation.sighting
     ring.evidence.sighted(observation.track, timestamp)
+
+
+def _scatter(ring: FusedRing, window: Window, information: Grid, distance: Grid) -> float:
+    """Return what an observation adds to the scatter: the mean over the cells that the outline passes."""
+    level, known = ring.level(window), ring.looked[window]
+    beside = (np.abs(level) < BESIDE) & (information > 0) & (known > 0)
+    if not beside.any():
+        return 0.0
+    level, known, information, distance = level[beside], known[beside], information[beside], distance[beside]
+    return float((known * information / (known + information) * (distance - level) ** 2).mean())
 
 
 def merge_rings(ring: FusedRing, other: FusedRing) -> None:
@@ -253,6 +273,8 @@ def merge_rings(ring: FusedRing, other: FusedRing) -> None:
     ring.looked = ring.looked + other.looked
     ring.seen_view = ring.seen_view + other.seen_view
     ring.seen += other.seen
+    ring.scatter += other.scatter
+    ring.marks = ring.marks | other.marks
     ring.evidence.absorb(other.evidence)
 
 

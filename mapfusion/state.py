@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.config import IntegratorConfig
+from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind
 from mapfusion.journal import LogBook
-from mapfusion.lines import Curve, Evidence, FusedLine
+from mapfusion.lines import Evidence, FusedLine
 from mapfusion.rings import FusedRing
+from mapfusion.uncertainty import ErrorModel
 
 if TYPE_CHECKING:
     from mapfusion.integrator import MapIntegrator
 
-FORMAT = 2
+FORMAT = 3
 """Version of the file's layout; files of another version are refused."""
 
 Item = TypeVar("Item")
@@ -45,7 +47,13 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
         "next_id": integrator.next_id,
         "logs": {log: [book.times, book.positions, book.believed] for log, book in integrator.journal.logs.items()},
         "lines": [
-            {"id": i, "kind": int(line.kind), "count": len(line.curve), "evidence": _plain(line.evidence)}
+            {
+                "id": i,
+                "kind": int(line.kind),
+                "count": len(line.curve),
+                "first": line.first,
+                "evidence": _plain(line.evidence),
+            }
             for i, line in lines.items()
         ],
         "rings": [
@@ -54,6 +62,7 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
                 "corner": ring.corner.tolist(),
                 "shape": ring.looked.shape,
                 "seen": ring.seen,
+                "scatter": ring.scatter,
                 "evidence": _plain(ring.evidence),
             }
             for i, ring in rings.items()
@@ -63,9 +72,10 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
     arrays = {
         "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
         "points": _flat(curves, lambda curve: curve.points.ravel(), np.float64),
-        "information": _flat(curves, lambda curve: curve.information, np.float64),
-        "seen": _flat(curves, lambda curve: curve.seen, np.float64),
-        "seen_view": _flat(curves, lambda curve: curve.seen_view, np.float64),
+        "sums": _flat(curves, lambda curve: curve.sums.ravel(), np.float64),
+        "marks": _flat(curves, lambda curve: curve.marks.ravel(), np.uint64),
+        "ring_marks": _flat(rings.values(), lambda ring: ring.marks, np.uint64),
+        "errors": integrator.errors.state(),
         "ring_distance": _flat(rings.values(), lambda ring: ring.distance.ravel(), np.float32),
         "ring_looked": _flat(rings.values(), lambda ring: ring.looked.ravel(), np.float32),
         "ring_seen_view": _flat(rings.values(), lambda ring: ring.seen_view.ravel(), np.float32),
@@ -105,26 +115,27 @@ def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str
     integrator.rejections = Counter(header["rejections"])
     integrator.frames, integrator.next_id = header["frames"], header["next_id"]
     integrator.journal.logs = {
-        log: LogBook(times, [(x, y) for x, y in positions], believed)
-        for log, (times, positions, believed) in header["logs"].items()
+        log: LogBook(number, times, [(x, y) for x, y in positions], believed)
+        for number, (log, (times, positions, believed)) in enumerate(header["logs"].items())
     }
-    points = arrays["points"].reshape(-1, 2)
+    integrator.errors = ErrorModel.from_state(arrays["errors"])
+    curves = Curve(arrays["points"].reshape(-1, 2), arrays["sums"].reshape(-1, 5), arrays["marks"].reshape(-1, 2))
     at = 0
     for entry in header["lines"]:
-        part = slice(at, at + entry["count"])
-        curve = Curve(points[part], arrays["information"][part], arrays["seen"][part], arrays["seen_view"][part])
-        line = FusedLine(ElementKind(entry["kind"]), curve, _evidence(entry["evidence"]))
+        curve = curves.part(at, at + entry["count"]).copy()
+        line = FusedLine(ElementKind(entry["kind"]), curve, _evidence(entry["evidence"]), entry["first"])
         integrator.put_line(entry["id"], line)
-        at = part.stop
+        at += len(curve)
     at = 0
-    for entry in header["rings"]:
+    for entry, marks in zip(header["rings"], arrays["ring_marks"].reshape(-1, 2), strict=True):
         shape = tuple(entry["shape"])
         part = slice(at, at + shape[0] * shape[1])
         distance, looked, seen_view = (
             arrays[name][part].reshape(shape) for name in ("ring_distance", "ring_looked", "ring_seen_view")
         )
         corner = np.array(entry["corner"], dtype=np.int64)
-        ring = FusedRing(corner, distance, looked, seen_view, entry["seen"], _evidence(entry["evidence"]))
+        evidence = _evidence(entry["evidence"])
+        ring = FusedRing(corner, distance, looked, seen_view, entry["seen"], evidence, entry["scatter"], marks.copy())
         integrator.put_ring(entry["id"], ring)
         at = part.stop
     tiles = [(int(row), int(column)) for row, column in header["tiles"]]

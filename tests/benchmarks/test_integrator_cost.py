@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mapfusion import ElementKind, FrameMap, MapIntegrator
-from mapfusion.lines import Curve, Evidence, FusedLine
+from mapfusion.curve import Curve
+from mapfusion.lines import Evidence, FusedLine
 from tests.mapfusion.simulation import ROI, pose
 
 pytestmark = pytest.mark.benchmark_only
@@ -50,7 +51,9 @@ def filled(size: int) -> MapIntegrator:
         row, column = divmod(number, side)
         points = np.stack([x + 50.0 * (column - side // 2), np.full(41, 8.0 * (row - side // 2) + 100.0)], axis=1)
         ones = np.ones(41)
-        line = FusedLine(ElementKind.DIVIDER, Curve(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {1: 5}))
+        line = FusedLine(
+            ElementKind.DIVIDER, Curve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {("", 1): 5})
+        )
         integrator.put_line(number, line)
     integrator.next_id = size
     if size <= 10_000:

@@ -12,7 +12,7 @@ import shapely
 import shapely.ops
 
 from mapfusion.elements import GlobalMap
-from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Drive, element, simulate
+from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Detector, Drive, element, simulate
 
 PROJECT = Path(__file__).parents[2]
 LOGS = (
@@ -21,7 +21,7 @@ LOGS = (
 )
 
 
-def log_drive(log: Path, seed: int, frames: int = 40) -> Drive:
+def log_drive(log: Path, seed: int, frames: int = 40, detector: Detector | None = None) -> Drive:
     """Return a simulated drive of 40 frames at 2 Hz (or as many as the log has) over the log's real lines."""
     table = feather.read_table(log / "city_SE3_egovehicle.feather").sort_by("timestamp_ns")
     stamps = table["timestamp_ns"].to_numpy()
@@ -34,7 +34,8 @@ def log_drive(log: Path, seed: int, frames: int = 40) -> Drive:
         pose[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
         pose[:2, 3] = [x, y]
         poses.append(pose)
-    return simulate(true_map(next((log / "map").glob("log_map_archive_*.json"))), poses, np.random.default_rng(seed))
+    truth = true_map(next((log / "map").glob("log_map_archive_*.json")))
+    return simulate(truth, poses, np.random.default_rng(seed), detector)
 
 
 def true_map(path: Path) -> GlobalMap:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import shapely
@@ -22,7 +22,11 @@ ROI = RegionOfInterest()
 
 @dataclass(frozen=True)
 class Detector:
-    """How the simulated detector errs; deviations in metres."""
+    """How the simulated detector errs; deviations in metres.
+
+    Of the variance of its displacements ``track_share`` stays as long as a track does and ``slow_share`` changes with
+    the way that the car goes, over ``slow_length`` metres; the rest is new in every frame.
+    """
 
     near: float = 0.15
     per_metre: float = 0.35 / 30.0
@@ -32,6 +36,40 @@ class Detector:
     id_switch: float = 0.05
     ghosts: float = 0.1
     points: int = 20
+    track_share: float = 0.0
+    slow_share: float = 0.0
+    slow_length: float = 20.0
+
+    def scaled(self, deviation: float) -> Detector:
+        """Return a detector whose displacements have this deviation on average (0.3 m unless told)."""
+        return replace(self, near=self.near * deviation / 0.3, per_metre=self.per_metre * deviation / 0.3)
+
+
+class LastingErrors:
+    """The parts of the displacement that stay from frame to frame, as coefficients ``(2, 3)`` of its shape."""
+
+    def __init__(self, rng: np.random.Generator, detector: Detector) -> None:
+        self.rng = rng
+        self.detector = detector
+        self.of_track: dict[int, Float] = {}
+        self.slow: dict[tuple[int, int], tuple[Float, Float]] = {}
+
+    def at(self, track: int, key: tuple[int, int], car: Float) -> Float:
+        """Return the coefficients for a piece of a true element and its track, seen from ``car`` ``(2,)``."""
+        coefficients = np.zeros((2, 3))
+        if self.detector.track_share:
+            if track not in self.of_track:
+                self.of_track[track] = self.rng.normal(size=(2, 3))
+            coefficients += np.sqrt(self.detector.track_share) * self.of_track[track]
+        if self.detector.slow_share:
+            fresh = self.rng.normal(size=(2, 3))
+            if key in self.slow:
+                before, seen_from = self.slow[key]
+                kept = np.exp(-np.linalg.norm(car - seen_from) / self.detector.slow_length)
+                fresh = kept * before + np.sqrt(1.0 - kept**2) * fresh
+            self.slow[key] = fresh, car
+            coefficients += np.sqrt(self.detector.slow_share) * fresh
+        return coefficients
 
 
 @dataclass(frozen=True)
@@ -157,6 +195,7 @@ def simulate(
     live: list[tuple[ElementKind, Float, list[int], int, int]] = []
     ghosts: list[tuple[ElementKind, Float, list[int], int, int]] = []
     frames = []
+    lasting = LastingErrors(rng, detector)
     box = shapely.box(*(-ROI.size / 2), *(ROI.size / 2))
     for number, ego_to_global in enumerate(poses):
         global_to_ego = inverse_pose(ego_to_global)
@@ -175,9 +214,9 @@ def simulate(
                 key = (row, part)
                 if key not in track_of or rng.random() < detector.id_switch:
                     track_of[key], next_track = next_track, next_track + 1
-                found.append(
-                    (int(true.kind), rng.uniform(0.4, 0.95), track_of[key], _err(true.kind, piece, rng, detector))
-                )
+                stays = lasting.at(track_of[key], key, ego_to_global[:2, 3])
+                score = rng.uniform(0.4, 0.95)
+                found.append((int(true.kind), score, track_of[key], _err(true.kind, piece, rng, detector, stays)))
         for _ in range(rng.poisson(detector.ghosts * max(len(found), 1) / 1.5)):
             kind = ElementKind(int(rng.integers(3)))
             ghost = (kind, transform_points(ego_to_global, _ghost(kind, rng)), [], next_track, int(rng.integers(1, 3)))
@@ -224,25 +263,32 @@ def visible_pieces(kind: ElementKind, local: Float, box: shapely.Polygon) -> lis
     return [shapely.get_coordinates(p) for p in parts if p.geom_type == "LineString" and p.length > 1.0]
 
 
-def _err(kind: ElementKind, piece: Float, rng: np.random.Generator, detector: Detector) -> Float:
-    """Displace a piece smoothly: one offset, a turn and a bend for the whole, little jitter per point."""
+def _err(
+    kind: ElementKind, piece: Float, rng: np.random.Generator, detector: Detector, stays: Float | float = 0.0
+) -> Float:
+    """Displace a piece smoothly: one offset, a turn and a bend for the whole, little jitter per point.
+
+    The vertices run either way and start anywhere; ``stays``, what of the displacement lasts, goes with the place.
+    """
     if not kind.is_ring:
         length = arc_length(piece)[-1]
         line = shapely.LineString(piece)
         start, stop = np.abs(rng.normal(0.0, detector.end, 2)).clip(0.0, length / 4)
         piece = shapely.get_coordinates(shapely.ops.substring(line, start, length - stop))
         points = resample(piece, detector.points)
-        if rng.random() < 0.3:
-            points = points[::-1]
+        way = -1.0 if rng.random() < 0.3 else 1.0
+        points = points if way > 0 else points[::-1]
     else:
         count = len(piece) - 1
         points = resample(np.roll(piece[:-1], rng.integers(count), axis=0)[np.r_[0:count, 0]], detector.points + 1)
-        points = points[::-1] if rng.random() < 0.5 else points
+        way = -1.0 if rng.random() < 0.5 else 1.0
+        points = points if way > 0 else points[::-1]
     u = np.linspace(-1.0, 1.0, len(points))
     if kind.is_ring:
         u = np.sin(np.pi * u)
     deviation = detector.near + detector.per_metre * np.linalg.norm(points, axis=1)
-    shape = np.sqrt([0.6, 0.25 * 3.0, 0.15 * 2.0]) * rng.normal(size=(2, 3))
+    new = np.sqrt(1.0 - detector.track_share - detector.slow_share) * rng.normal(size=(2, 3))
+    shape = np.sqrt([0.6, 0.25 * 3.0, 0.15 * 2.0]) * (new + stays * np.array([1.0, way, 1.0]))
     error = shape[:, 0:1] + shape[:, 1:2] * u + shape[:, 2:3] * np.cos(np.pi * u)
     noisy = points + (deviation * error).T + rng.normal(0.0, detector.jitter, points.shape)
     if kind.is_ring:
