@@ -234,7 +234,7 @@ def _stretches(
             if state < 0:
                 continue
             change = ORDER[state]
-            if change is Change.ADDED and (end - start) * config.spacing < SHORTEST_ADDED:
+            if change is Change.ADDED and samples.spacing[first + start : first + end].sum() < SHORTEST_ADDED:
                 continue
             rows = slice(first + start, first + min(end + 1, stop - first))
             if rows.stop - rows.start < 2:

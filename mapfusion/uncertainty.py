@@ -62,6 +62,9 @@ COMPANIONS = 12
 OUTLIER = 9.0 / 0.455
 """Squared differences count as at most so many medians: three deviations of a normal distribution."""
 
+LEAST_VARIANCE = 1e-3
+"""No detector is better than this, as a multiple of the variance that it is assumed to have."""
+
 LAGS = np.array([0.0, 2.5, 7.5, 15.0, 30.0, 60.0, np.inf])
 """Classes of the distance that the car went between two observations, metres."""
 
@@ -188,7 +191,7 @@ class ErrorModel:
         level, lag = self.squares[row, column] / pairs, self.lags[row, column] / pairs
         basis = np.column_stack([np.ones(len(row)), 1.0 - np.exp(-lag[:, None] / LASTING), row])
         expected = basis @ PRIOR_SHARES
-        total = float((contrasts * level).sum() / (contrasts * expected).sum())
+        total = max(float((contrasts * level).sum() / (contrasts * expected).sum()), LEAST_VARIANCE)
         # a squared normal variable has a variance of twice its squared mean
         weight = np.sqrt(contrasts / 2.0) / (total * expected)
         prior = 1.0 / (total * PRIOR_SPREAD)
