@@ -205,7 +205,7 @@ class RevivalConfig(Section):
 
     enabled: bool = True
     frames: Positive = 10
-    distance: Metres = 1.5
+    distance: Metres = 2.5
     capacity: Positive = 32
 
 
