@@ -31,12 +31,12 @@ def import_weights(
     if out.suffix != ".safetensors":
         raise UserError(f"Weights are written as safetensors: name a file that ends so, not {out.name}.")
     check_output(out)
-    from predmapnet.weights.checkpoint import weights_hash
-    from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint, save_maptracker
+    from predmapnet.weights.checkpoint import save_checkpoint, weights_hash
+    from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint
 
     network, report = import_maptracker(read_official_checkpoint(checkpoint))
     facts = {"imported_from": checkpoint.name, "sha256_of_source": weights_hash(checkpoint)}
-    save_maptracker(out, network, facts)
+    save_checkpoint(out, network, facts)
     _say_import(report, out)
 
 

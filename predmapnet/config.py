@@ -58,41 +58,105 @@ class WholeImageConfig(Section):
     mean: tuple[float, float, float] = (103.530, 116.280, 123.675)
 
 
-def _image_kind(value: object) -> str:
-    """Tell the kind of image input; files that were written before there were two have none."""
-    kind = value.get("kind", "window") if isinstance(value, Mapping) else getattr(value, "kind", "")
-    return str(kind)
+def _kind(default: str) -> Discriminator:
+    """Tell sections of one name apart by their ``kind``; files that were written before there were two have none."""
+
+    def kind(value: object) -> str:
+        return str(value.get("kind", default) if isinstance(value, Mapping) else getattr(value, "kind", ""))
+
+    return Discriminator(kind)
 
 
 ImageConfig = Annotated[
-    Annotated[ImageWindowConfig, Tag("window")] | Annotated[WholeImageConfig, Tag("whole")],
-    Discriminator(_image_kind),
+    Annotated[ImageWindowConfig, Tag("window")] | Annotated[WholeImageConfig, Tag("whole")], _kind("window")
 ]
 """What the network sees of each camera."""
 
 
-class BackboneConfig(Section):
+class SmallBackboneConfig(Section):
     """A small residual network with a feature pyramid to stride 4."""
 
+    kind: Literal["small"] = "small"
     stem: tuple[Positive, Positive] = (16, 32)
     widths: tuple[Positive, Positive, Positive] = (32, 48, 96)
     blocks: tuple[Positive, Positive, Positive] = (1, 2, 2)
     channels: Positive = 32
 
 
-class BevConfig(Section):
-    """The BEV grid (``rows`` x ``columns`` cells of ``H x W``) and the widths of its three levels, fine to coarse.
+class ResNet50Config(Section):
+    """ResNet-50 with deformable convolutions, and a feature pyramid at strides 8, 16 and 32.
 
-    The view transform looks up twice as many cells in each direction.
+    Attributes:
+        channels: of each level of the pyramid.
     """
 
+    kind: Literal["resnet50"] = "resnet50"
+    channels: Positive = 256
+
+
+BackboneConfig = Annotated[
+    Annotated[SmallBackboneConfig, Tag("small")] | Annotated[ResNet50Config, Tag("resnet50")], _kind("small")
+]
+"""What makes features of the images."""
+
+
+class LookupBevConfig(Section):
+    """A look-up of the image features on the ground, then a U-Net.
+
+    The look-up finds twice as many cells in each direction as the grid has.
+
+    Attributes:
+        rows: of the BEV grid, along y.
+        columns: of the BEV grid, along x.
+        widths: channels of the three BEV levels, fine to coarse.
+    """
+
+    kind: Literal["lookup"] = "lookup"
     rows: Positive = 50
     columns: Positive = 100
     widths: tuple[Positive, Positive, Positive] = (48, 80, 128)
 
 
-class TemporalBevConfig(Section):
-    """Memory of past BEV maps (MapTracker's strided selection, with validity masks).
+class BevFormerConfig(Section):
+    """Learned queries of the ground cells that look into the images (BEVFormer), past BEV maps included.
+
+    Attributes:
+        rows: of the BEV grid, along y.
+        columns: of the BEV grid, along x.
+        width: channels of the BEV features.
+        cameras: number and order matter, since each has a learned code.
+        pillar_low: lowest of the heights at which a cell looks into the images, metres in the ego frame.
+        pillar_high: highest of them.
+        pillar_points: number of heights.
+    """
+
+    kind: Literal["bevformer"] = "bevformer"
+    rows: Positive = 50
+    columns: Positive = 100
+    width: Positive = 256
+    heads: Positive = 8
+    layers: Positive = 2
+    hidden: Positive = 512
+    dropout: Fraction = 0.1
+    cameras: Positive = 6
+    pillar_low: float = -2.5
+    pillar_high: float = 4.5
+    pillar_points: Positive = 4
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Channels of the three BEV levels, fine to coarse."""
+        return self.width, self.width, self.width
+
+
+BevConfig = Annotated[
+    Annotated[LookupBevConfig, Tag("lookup")] | Annotated[BevFormerConfig, Tag("bevformer")], _kind("lookup")
+]
+"""The BEV grid (``rows`` x ``columns`` cells of ``H x W``) and what fills it."""
+
+
+class ResidualBevMemoryConfig(Section):
+    """Past BEV maps, compressed, enter the finished BEV features as a residual.
 
     Attributes:
         enabled: switch.
@@ -102,11 +166,32 @@ class TemporalBevConfig(Section):
         spacing: the newest map is replaced until the car has moved this far, metres.
     """
 
+    kind: Literal["residual"] = "residual"
     enabled: bool = True
     channels: Positive = 16
     distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
     capacity: Positive = 8
     spacing: Annotated[float, Field(ge=0.0)] = 2.0
+
+
+class EncoderBevMemoryConfig(Section):
+    """Past BEV maps enter the BEV encoder after each of its layers (MapTracker's BEV memory fusion).
+
+    Attributes:
+        distances: metres back at which maps are chosen.
+        capacity: frames that are remembered.
+    """
+
+    kind: Literal["encoder"] = "encoder"
+    distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
+    capacity: Positive = 20
+
+
+BevMemoryConfig = Annotated[
+    Annotated[ResidualBevMemoryConfig, Tag("residual")] | Annotated[EncoderBevMemoryConfig, Tag("encoder")],
+    _kind("residual"),
+]
+"""How past BEV maps are used."""
 
 
 class SemanticQueriesConfig(Section):
@@ -153,9 +238,10 @@ class FutureConfig(Section):
     """The forecast starts from the last step of the car, taken once more; off, the polylines alone tell (the paper)."""
 
 
-class DecoderConfig(Section):
-    """Map decoder: N_q queries of width C, N_p points each, refined by point layers."""
+class PointDecoderConfig(Section):
+    """N_q queries of width C with N_p points each, refined by layers that move every point."""
 
+    kind: Literal["points"] = "points"
     queries: Positive = 40
     points: Annotated[int, Field(ge=2)] = 20
     width: Positive = 128
@@ -166,6 +252,66 @@ class DecoderConfig(Section):
     classes: Positive = 3
 
 
+class MapTrackerDecoderConfig(Section):
+    """MapTracker's decoder: N_q queries of width C whose lines of N_p points are predicted anew by every layer.
+
+    Each track also attends to its own queries of past frames (the vector memory).
+
+    Attributes:
+        memory_distances: metres back at which past queries are chosen.
+        memory_capacity: frames that are remembered.
+    """
+
+    kind: Literal["maptracker"] = "maptracker"
+    queries: Positive = 100
+    points: Annotated[int, Field(ge=2)] = 20
+    width: Positive = 512
+    heads: Positive = 8
+    layers: Positive = 6
+    hidden: Positive = 1024
+    dropout: Fraction = 0.1
+    classes: Positive = 3
+    memory_distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
+    memory_capacity: Positive = 20
+
+
+DecoderConfig = Annotated[
+    Annotated[PointDecoderConfig, Tag("points")] | Annotated[MapTrackerDecoderConfig, Tag("maptracker")],
+    _kind("points"),
+]
+"""From queries to polylines."""
+
+
+class MapTrackerQuirks(Section):
+    """What the official code does oddly. Its released weights need all of it; a network trained from scratch does not.
+
+    Attributes:
+        mirrored_self_attention: the BEV self-attention looks around the cell mirrored in y, since its reference
+            points count rows from the right-hand side while the map counts them from the left.
+        propagate_where_sum_is_positive: a warped history cell replaces the learned BEV query only where the sum of
+            its channels is above zero, instead of everywhere where history reaches.
+        endpoint_warp_grid: history is warped on a grid whose first and last cells lie on the border of the ROI, but
+            sampled as if cells had their centres inside: a slight zoom at every frame.
+        tracks_moved_from_chosen_history: tracks are moved by the motion since the nearest BEV map that was chosen
+            (at least 1 m back), although they stem from the frame before.
+        norm_before_cross_attention: the decoder's second norm is fed the input of the BEV attention, not its output,
+            and is left out in the first frame of a scene.
+        single_precision_memory_poses: the vector memory keeps global poses in 32 bits.
+    """
+
+    mirrored_self_attention: bool = False
+    propagate_where_sum_is_positive: bool = False
+    endpoint_warp_grid: bool = False
+    tracks_moved_from_chosen_history: bool = False
+    norm_before_cross_attention: bool = False
+    single_precision_memory_poses: bool = False
+
+
+QUIRKS_OF_ENCODER = ("mirrored_self_attention", "propagate_where_sum_is_positive", "endpoint_warp_grid")
+QUIRKS_OF_DECODER = ("norm_before_cross_attention", "single_precision_memory_poses")
+ALL_QUIRKS = MapTrackerQuirks(**dict.fromkeys(MapTrackerQuirks.model_fields, True))
+
+
 class TrackingConfig(Section):
     """Which rows live on (Sec. 3.1) and how tracks and detections of one instance become one row.
 
@@ -173,6 +319,7 @@ class TrackingConfig(Section):
         query_assignment: ``one_way``: detection queries never see tracks and are trained on all of the truth;
             ``suppress``: tracks take their truth away from the detections (the paper's and MapTracker's scheme).
         tau_d: a detection scored above it is born as a track.
+        first_tau_d: the same in the first frame of a stream; ``tau_d`` by default.
         tau_t: a track scored above it is supported; others count a miss.
         misses_allowed: consecutive misses after which a track ends is one more than this; 0 is the paper's scheme.
         merge: merge tracks with detections and with each other.
@@ -184,6 +331,7 @@ class TrackingConfig(Section):
 
     query_assignment: Literal["one_way", "suppress"] = "one_way"
     tau_d: Fraction = 0.5
+    first_tau_d: Fraction | None = None
     tau_t: Fraction = 0.3
     misses_allowed: Annotated[int, Field(ge=0)] = 6
     merge: bool = True
@@ -209,6 +357,16 @@ class RevivalConfig(Section):
     capacity: Positive = 32
 
 
+class SegmentationConfig(Section):
+    """The segmentation of the ground at twice the resolution of the BEV grid.
+
+    Attributes:
+        kind: ``pixel_shuffle`` computes on the BEV grid, ``upsampling`` (MapTracker) on the finer one.
+    """
+
+    kind: Literal["pixel_shuffle", "upsampling"] = "pixel_shuffle"
+
+
 class DepthConfig(Section):
     """Auxiliary depth head (training only): depth bins over ``[near, far]`` metres."""
 
@@ -230,17 +388,50 @@ class PredMapNetConfig(Section):
     roi_length: Metres = 60.0
     roi_width: Metres = 30.0
     image: ImageConfig = ImageWindowConfig()
-    backbone: BackboneConfig = BackboneConfig()
-    bev: BevConfig = BevConfig()
-    temporal_bev: TemporalBevConfig = TemporalBevConfig()
+    backbone: BackboneConfig = SmallBackboneConfig()
+    bev: BevConfig = LookupBevConfig()
+    temporal_bev: BevMemoryConfig = ResidualBevMemoryConfig()
+    segmentation: SegmentationConfig = SegmentationConfig()
     semantic_queries: SemanticQueriesConfig = SemanticQueriesConfig()
     masks: MaskConfig = MaskConfig()
     history_map: HistoryMapConfig = HistoryMapConfig()
     future: FutureConfig = FutureConfig()
-    decoder: DecoderConfig = DecoderConfig()
+    decoder: DecoderConfig = PointDecoderConfig()
     tracking: TrackingConfig = TrackingConfig()
     revival: RevivalConfig = RevivalConfig()
     depth: DepthConfig = DepthConfig()
+    quirks: MapTrackerQuirks = MapTrackerQuirks()
+
+    @model_validator(mode="after")
+    def _parts_fit_together(self) -> Self:
+        """Refuse parts that cannot work on each other."""
+        bevformer = isinstance(self.bev, BevFormerConfig)
+        maptracker = isinstance(self.decoder, MapTrackerDecoderConfig)
+        set_quirks = {name for name, value in self.quirks if value}
+        faults = {
+            "bev 'bevformer' reads the three levels of backbone 'resnet50', and 'lookup' the one of 'small'": bevformer
+            != isinstance(self.backbone, ResNet50Config),
+            "bev 'bevformer' needs temporal_bev 'encoder', and 'lookup' needs 'residual'": bevformer
+            != isinstance(self.temporal_bev, EncoderBevMemoryConfig),
+            "bev 'bevformer' needs backbone.channels of its own width": isinstance(self.bev, BevFormerConfig)
+            and self.backbone.channels != self.bev.width,
+            "bev 'bevformer' has masks on its own grid only: set masks.stride to 1": bevformer
+            and self.masks.stride != 1,
+            "decoder 'maptracker' lets detections see tracks: set tracking.query_assignment to 'suppress'": maptracker
+            and self.tracking.query_assignment != "suppress",
+            "quirk tracks_moved_from_chosen_history needs bev 'bevformer' and decoder 'maptracker'": not (
+                bevformer and maptracker
+            )
+            and self.quirks.tracks_moved_from_chosen_history,
+            "these quirks belong to bev 'bevformer': " + ", ".join(QUIRKS_OF_ENCODER): not bevformer
+            and bool(set_quirks & set(QUIRKS_OF_ENCODER)),
+            "these quirks belong to decoder 'maptracker': " + ", ".join(QUIRKS_OF_DECODER): not maptracker
+            and bool(set_quirks & set(QUIRKS_OF_DECODER)),
+        }
+        said = [fault for fault, holds in faults.items() if holds]
+        if said:
+            raise ValueError("; ".join(said))
+        return self
 
     @property
     def roi(self) -> RegionOfInterest:
@@ -257,7 +448,63 @@ class PredMapNetConfig(Section):
         return self.model_dump_json()
 
 
-PRESETS = {"lite": PredMapNetConfig(name="lite", future=FutureConfig(steady_motion=True))}
+def _maptracker(name: str, image: WholeImageConfig, cameras: int) -> PredMapNetConfig:
+    """Return the baseline: none of the paper's modules, and the sizes and thresholds of the released weights."""
+    return PredMapNetConfig(
+        name=name,
+        image=image,
+        backbone=ResNet50Config(),
+        bev=BevFormerConfig(cameras=cameras),
+        temporal_bev=EncoderBevMemoryConfig(),
+        segmentation=SegmentationConfig(kind="upsampling"),
+        semantic_queries=SemanticQueriesConfig(enabled=False),
+        masks=MaskConfig(stride=1, channels=256),
+        history_map=HistoryMapConfig(memory=False, guidance=False),
+        future=FutureConfig(enabled=False),
+        decoder=MapTrackerDecoderConfig(),
+        revival=RevivalConfig(enabled=False),
+        tracking=TrackingConfig(
+            query_assignment="suppress",
+            tau_d=0.6,
+            first_tau_d=0.4,
+            tau_t=0.5,
+            misses_allowed=0,
+            merge=False,
+            report_threshold=0.0,
+        ),
+        quirks=ALL_QUIRKS,
+    )
+
+
+def _paper(name: str, baseline: PredMapNetConfig) -> PredMapNetConfig:
+    """Return the whole network of the paper on a baseline, with the hyperparameters of Sec. 4.1.
+
+    The paper does not tell L; three layers visit each BEV level once. The quirks stay, since the network starts from
+    the baseline's weights.
+    """
+    changes = {
+        "name": name,
+        "semantic_queries": SemanticQueriesConfig(layers=3),
+        "history_map": HistoryMapConfig(),
+        "future": FutureConfig(hidden=512),
+        "tracking": baseline.tracking.model_copy(update={"tau_d": 0.4, "first_tau_d": None}),
+        "depth": DepthConfig(enabled=True, bins=68, far=35.0),
+    }
+    return baseline.model_copy(update=changes)
+
+
+_NUSCENES = _maptracker("maptracker-nuscenes", WholeImageConfig(), cameras=6)
+_ARGOVERSE2 = _maptracker("maptracker-av2", WholeImageConfig(width=608, height=608), cameras=7)
+PRESETS = {
+    config.name: config
+    for config in (
+        PredMapNetConfig(name="lite", future=FutureConfig(steady_motion=True)),
+        _paper("paper-nuscenes", _NUSCENES),
+        _paper("paper-av2", _ARGOVERSE2),
+        _NUSCENES,
+        _ARGOVERSE2,
+    )
+}
 
 
 def preset(name: str) -> PredMapNetConfig:
@@ -284,8 +531,14 @@ def parse_config(text: str | bytes, origin: str) -> PredMapNetConfig:
     try:
         return PredMapNetConfig.model_validate_json(text)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, fault['loc'])) or 'file'}: {fault['msg']}" for fault in error.errors())
+        faults = "; ".join(f"{_place(fault['loc']) or 'file'}: {fault['msg']}" for fault in error.errors())
         raise UserError(f"the configuration in {origin} does not fit: {faults}") from error
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    """Name a key as the file has it: pydantic puts a section's kind behind the section's name."""
+    kinds = {"image", "backbone", "bev", "temporal_bev", "decoder"}
+    return ".".join(str(part) for at, part in enumerate(location) if at != 1 or location[0] not in kinds)
 
 
 def load_config(name_or_path: str | Path) -> PredMapNetConfig:

@@ -17,10 +17,9 @@ from predmapnet.datasets.images import read_image
 from predmapnet.datasets.source import Float, Frame, Image, Rig
 from predmapnet.errors import UserError
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
-from predmapnet.network.interface import FrameInputs, Instances, Selection, StreamState
+from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import select
-from predmapnet.network.view_transform import RigLookup
 from predmapnet.weights.checkpoint import load_checkpoint
 
 RIG_TOLERANCE = 1e-4
@@ -71,7 +70,7 @@ class Mapper:
         self.weights_sha256 = weights_sha256
         self.trained_on = trained_on
         self._device = torch.device(device)
-        self._lookups: list[tuple[Rig, RigLookup]] = []
+        self._lookups: list[tuple[Rig, RigGeometry]] = []
 
     @classmethod
     def from_checkpoint(cls, path: Path | None = None, device: str = "auto") -> Mapper:
@@ -157,7 +156,7 @@ class Mapper:
         )
         return frame_map, state
 
-    def _lookup(self, rig: Rig) -> RigLookup:
+    def _lookup(self, rig: Rig) -> RigGeometry:
         """Return the look-up of a rig, from the few that were used last."""
         for position, (known, lookup) in enumerate(self._lookups):
             if known is rig or _same_rig(known, rig):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.config import BevConfig
+from predmapnet.config import LookupBevConfig
+from predmapnet.network.interface import FrameInputs, RigGeometry, StreamState
 from predmapnet.network.layers import ConvNorm, ResidualBlock
+from predmapnet.network.view_transform import RigLookup, to_ground
 
 
 class BevEncoder(nn.Module):
     """Ground features at 0.3 m to three levels at 0.6, 1.2 and 2.4 m."""
 
-    def __init__(self, channels_in: int, config: BevConfig) -> None:
+    def __init__(self, channels_in: int, config: LookupBevConfig) -> None:
         super().__init__()
         fine, middle, coarse = config.widths
         self.reduce = nn.Conv2d(channels_in, fine, 2, stride=2, bias=False)
@@ -27,18 +31,28 @@ class BevEncoder(nn.Module):
         self.middle_to_fine = ConvNorm(middle, fine, 1, relu=False)
         self.fine_out = ResidualBlock(fine, fine)
 
-    def forward(self, ground: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Encode ``(B, C_in, 2 H, 2 W)``.
+    def forward(
+        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: RigGeometry, state: StreamState | None
+    ) -> list[Tensor]:
+        """Encode.
+
+        Args:
+            levels: image features of a single level, ``(B, N, C_in, h', w')``.
+            inputs: which cameras count.
+            geometry: look-up of the rig.
+            state: not used; here past maps come in after the encoder (:mod:`predmapnet.network.temporal_bev`).
 
         Returns:
             ``(B, C_0, H, W)``, ``(B, C_1, H / 2, W / 2)`` and ``(B, C_2, H / 4, W / 4)``, sizes rounded up.
         """
+        assert isinstance(geometry, RigLookup), "a rig's look-up comes from make_rig_lookup"
+        ground = to_ground(levels[0], inputs.camera_valid, geometry)
         fine = self.fine_in(F.relu(self.norm(self.reduce(ground) + self.position)))
         middle = self.middle_in(fine)
         coarse = self.coarse(middle)
         middle = self.middle_out(middle + _resize(self.coarse_to_middle(coarse), middle))
         fine = self.fine_out(fine + _resize(self.middle_to_fine(middle), fine))
-        return fine, middle, coarse
+        return [fine, middle, coarse]
 
 
 def _resize(features: Tensor, like: Tensor) -> Tensor:

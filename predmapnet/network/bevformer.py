@@ -10,9 +10,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from predmapnet.config import BevFormerConfig, PredMapNetConfig
+from predmapnet.network.bev_history import look_back
 from predmapnet.network.camera_pillars import CameraPillars, pixel_positions
 from predmapnet.network.deformable_attention import deformable_attention
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.interface import FrameInputs, RigGeometry, StreamState
+from predmapnet.network.layers import ResidualPerceptron, flatten_cells
 from predmapnet.network.matrix_product import Linear
 from predmapnet.network.temporal_fusion import TemporalFusion
 
@@ -31,11 +34,11 @@ class BevSelfAttention(nn.Module):
     QUEUE = 2
     POINTS = 4
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: BevFormerConfig, mirrored: bool) -> None:
         super().__init__()
-        width, self.heads = config.bev_width, config.bev_heads
+        width, self.heads = config.width, config.heads
         self.grid = (config.rows, config.columns)
-        self.mirrored = config.quirks.mirrored_self_attention
+        self.mirrored = mirrored
         samples = self.heads * self.QUEUE * self.POINTS
         self.sampling_offsets = Linear(2 * width, 2 * samples)
         self.attention_weights = Linear(2 * width, samples)
@@ -80,9 +83,9 @@ class ImageCrossAttention(nn.Module):
 
     POINTS = 8
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: BevFormerConfig) -> None:
         super().__init__()
-        width, self.heads = config.bev_width, config.bev_heads
+        width, self.heads = config.width, config.heads
         samples = self.heads * IMAGE_LEVELS * self.POINTS
         self.sampling_offsets = Linear(width, 2 * samples)
         self.attention_weights = Linear(width, samples)
@@ -134,31 +137,16 @@ class ImageCrossAttention(nn.Module):
         return found.view(batch, pairs, -1)
 
 
-class ResidualPerceptron(nn.Module):
-    """Two linear layers with ReLU between them, and the input."""
-
-    def __init__(self, width: int, hidden: int, dropout: float) -> None:
-        super().__init__()
-        self.first = Linear(width, hidden)
-        self.second = Linear(hidden, width)
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Map ``(..., C)`` to ``(..., C)``."""
-        return tokens + self.dropout(self.second(self.dropout(torch.relu(self.first(tokens)))))
-
-
 class BevEncoderLayer(nn.Module):
     """Self-attention, image cross-attention, perceptron (each with a norm after the sum), and past maps."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: BevFormerConfig, past_maps: int, mirrored: bool) -> None:
         super().__init__()
-        width = config.bev_width
-        self.self_attention = BevSelfAttention(config)
+        self.self_attention = BevSelfAttention(config, mirrored)
         self.image_attention = ImageCrossAttention(config)
-        self.perceptron = ResidualPerceptron(width, config.bev_hidden, config.dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(3))
-        self.fusion = TemporalFusion(width, len(config.history_distances))
+        self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(3))
+        self.fusion = TemporalFusion(config.width, past_maps)
 
     def forward(
         self, cells: Tensor, code: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor, history: Tensor
@@ -168,56 +156,55 @@ class BevEncoderLayer(nn.Module):
         cells = self.norms[1](self.image_attention(cells, tokens, pillars, camera_valid))
         cells = self.norms[2](self.perceptron(cells))
         bev = _as_map(cells, history.shape[-2:])
-        return _as_cells(bev + self.fusion(history, bev))
+        return flatten_cells(bev + self.fusion(history, bev))
 
 
 class BevFormer(nn.Module):
     """From image features to the BEV map."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        width, cells = config.bev_width, config.rows * config.columns
-        self.grid = (config.rows, config.columns)
+        self.config = config
+        bev = config.bev
+        assert isinstance(bev, BevFormerConfig)
+        width, self.grid = bev.width, (bev.rows, bev.columns)
         self.where_sum_is_positive = config.quirks.propagate_where_sum_is_positive
-        self.queries = nn.Parameter(torch.randn(cells, width))
-        self.row_code = nn.Parameter(torch.rand(config.rows, width // 2))
-        self.column_code = nn.Parameter(torch.rand(config.columns, width // 2))
+        self.queries = nn.Parameter(torch.randn(bev.rows * bev.columns, width))
+        self.row_code = nn.Parameter(torch.rand(bev.rows, width // 2))
+        self.column_code = nn.Parameter(torch.rand(bev.columns, width // 2))
         self.level_code = nn.Parameter(torch.randn(LEVEL_CODES, width))
-        self.camera_code = nn.Parameter(torch.randn(config.cameras, width))
-        self.layers = nn.ModuleList(BevEncoderLayer(config) for _ in range(config.bev_layers))
+        self.camera_code = nn.Parameter(torch.randn(bev.cameras, width))
+        past_maps, mirrored = len(config.temporal_bev.distances), config.quirks.mirrored_self_attention
+        self.layers = nn.ModuleList(BevEncoderLayer(bev, past_maps, mirrored) for _ in range(bev.layers))
 
     def forward(
-        self,
-        levels: Sequence[Tensor],
-        pillars: CameraPillars,
-        camera_valid: Tensor,
-        history: Tensor,
-        history_valid: Tensor,
-    ) -> Tensor:
+        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: RigGeometry, state: StreamState
+    ) -> list[Tensor]:
         """Encode.
 
         Args:
             levels: image features ``(B, N, C, h_i, w_i)``, fine to coarse.
-            pillars: of the rig.
-            camera_valid: ``(B, N) bool``.
-            history: past maps ``(B, S, C, H, W)`` in the current ego frame, from far to near.
-            history_valid: ``(B, S) bool``.
+            inputs: which cameras count, and poses.
+            geometry: pillars of the rig.
+            state: of the last frame; its maps take part.
 
         Returns:
-            ``(B, C, H, W)``, channels-last in memory.
+            A single level ``(B, C, H, W)``, channels-last in memory.
         """
-        cells = self.first_queries(history, history_valid)
+        assert isinstance(geometry, CameraPillars), "a rig's pillars come from make_rig_lookup"
+        history = look_back(state, inputs.ego_to_global, self.config)
+        cells = self.first_queries(history.maps, history.valid)
         code, tokens = self.position_code(), self.image_tokens(levels)
         for layer in self.layers:
-            cells = layer(cells, code, tokens, pillars, camera_valid, history)
-        return _as_map(cells, self.grid)
+            cells = layer(cells, code, tokens, geometry, inputs.camera_valid, history.maps)
+        return [_as_map(cells, self.grid)]
 
     def first_queries(self, history: Tensor, history_valid: Tensor) -> Tensor:
         """Return the queries ``(B, H * W, C)``: of the nearest past map where it reaches, learned ones elsewhere."""
         batch, slots = history_valid.shape
         if slots == 0:
             return self.queries.expand(batch, -1, -1)
-        past = _as_cells(history[:, -1])
+        past = flatten_cells(history[:, -1])
         # Released weights take a cell for empty unless its channels add up to more than zero.
         reached = past.sum(dim=-1) > 0 if self.where_sum_is_positive else (past != 0).any(dim=-1)
         return torch.where((reached & history_valid[:, -1:])[..., None], past, self.queries)
@@ -246,8 +233,3 @@ def _stream_rows(batch: int, queries: int, rows: int, device: torch.device) -> T
 def _as_map(cells: Tensor, grid: Sequence[int]) -> Tensor:
     """Turn ``(B, H * W, C)`` into ``(B, C, H, W)``, channels-last in memory."""
     return cells.unflatten(1, tuple(grid)).permute(0, 3, 1, 2)
-
-
-def _as_cells(bev: Tensor) -> Tensor:
-    """Turn ``(B, C, H, W)`` into ``(B, H * W, C)``."""
-    return bev.flatten(2).transpose(1, 2)

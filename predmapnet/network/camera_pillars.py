@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mapfusion.elements import RegionOfInterest
+from predmapnet.config import BevFormerConfig
 from predmapnet.network.layers import cell_centres
-from predmapnet.network.maptracker_config import MapTrackerConfig
 
 LEVEL_STRIDES = (8, 16, 32)
 NEAREST_DEPTH = 1e-5
@@ -47,7 +48,9 @@ class CameraPillars:
         return replace(self, **moved)
 
 
-def make_camera_pillars(ego_to_image: Tensor, image_size: tuple[int, int], config: MapTrackerConfig) -> CameraPillars:
+def make_camera_pillars(
+    ego_to_image: Tensor, image_size: tuple[int, int], config: BevFormerConfig, roi: RegionOfInterest
+) -> CameraPillars:
     """Project the pillars of all cells into all cameras.
 
     Args:
@@ -55,8 +58,9 @@ def make_camera_pillars(ego_to_image: Tensor, image_size: tuple[int, int], confi
             the network's input.
         image_size: rows and columns of the network's input.
         config: grid and pillars.
+        roi: the region that the grid covers.
     """
-    positions, hits = project_pillars(ego_to_image, image_size, config)
+    positions, hits = project_pillars(ego_to_image, image_size, config, roi)
     sees = hits.any(dim=-1)
     camera, cell = sees.nonzero(as_tuple=True)
     height, width = image_size
@@ -70,7 +74,7 @@ def make_camera_pillars(ego_to_image: Tensor, image_size: tuple[int, int], confi
 
 
 def project_pillars(
-    ego_to_image: Tensor, image_size: tuple[int, int], config: MapTrackerConfig
+    ego_to_image: Tensor, image_size: tuple[int, int], config: BevFormerConfig, roi: RegionOfInterest
 ) -> tuple[Tensor, Tensor]:
     """Project every point of every pillar.
 
@@ -78,7 +82,7 @@ def project_pillars(
         Positions ``(N, cells, Z, 2) float32`` in the images, 0 to 1 where inside, and which points are inside, as
         ``(N, cells, Z) bool``.
     """
-    points = _pillars(config).to(ego_to_image.device)
+    points = _pillars(config, roi).to(ego_to_image.device)
     projected = torch.einsum("nij,czj->nczi", ego_to_image.float(), points)
     depth = projected[..., 2]
     height, width = image_size
@@ -88,9 +92,9 @@ def project_pillars(
     return positions, inside & (depth > NEAREST_DEPTH)
 
 
-def _pillars(config: MapTrackerConfig) -> Tensor:
+def _pillars(config: BevFormerConfig, roi: RegionOfInterest) -> Tensor:
     """Return the points ``(cells, Z, 4) float32`` in the ego frame, homogeneous."""
-    ground = (cell_centres(config.rows, config.columns).double() - 0.5) * torch.tensor(config.roi.size)
+    ground = (cell_centres(config.rows, config.columns).double() - 0.5) * torch.tensor(roi.size)
     heights = torch.linspace(config.pillar_low, config.pillar_high, config.pillar_points, dtype=torch.float64)
     ground = ground.view(-1, 1, 2).expand(-1, len(heights), 2)
     heights = heights[None, :, None].expand(len(ground), -1, 1)

@@ -1,4 +1,4 @@
-"""The motion of the car between two instants: of points, of polylines and of BEV maps."""
+"""The motion of the car between two instants: as poses, and of points, polylines and BEV maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ def relative_motion(a_to_global: Tensor, b_to_global: Tensor) -> Tensor:
     rotation = b_to_global[..., :3, :3].transpose(-1, -2)
     position = a_to_global[..., :3, 3:] - b_to_global[..., :3, 3:]
     a_to_b = torch.cat([rotation @ a_to_global[..., :3, :3], rotation @ position], dim=-1)
-    return a_to_b[..., :2, [0, 1, 3]].float()
+    return plane_motion(a_to_b).float()
+
+
+def plane_motion(a_to_b: Tensor) -> Tensor:
+    """Return the part ``(..., 2, 3)`` of poses ``(..., 4, 4)`` or ``(..., 3, 4)`` that moves x and y of the ground."""
+    return torch.cat([a_to_b[..., :2, :2], a_to_b[..., :2, 3:]], dim=-1)
 
 
 def move_points(points: Tensor, a_to_b: Tensor, roi: RegionOfInterest) -> Tensor:
@@ -32,16 +37,17 @@ def move_points(points: Tensor, a_to_b: Tensor, roi: RegionOfInterest) -> Tensor
 
     Args:
         points: ``(B, ..., 2)`` in frame a, normalised.
-        a_to_b: ``(B, 2, 3)``, metres.
+        a_to_b: ``(B, 2, 3)``, metres, in the precision of the points.
         roi: the region of both frames.
 
     Returns:
         ``(B, ..., 2)`` in frame b, normalised; points may lie outside [0, 1].
     """
-    size = points.new_tensor([roi.length, roi.width])
-    metres = ((points - 0.5) * size).flatten(1, -2)
+    x, y = (points - 0.5).flatten(1, -2).unbind(-1)
+    metres = torch.stack([x * roi.length, y * roi.width], dim=-1)
     moved = metres @ a_to_b[:, :, :2].transpose(1, 2) + a_to_b[:, None, :, 2]
-    return (moved / size + 0.5).view_as(points)
+    x, y = moved.unbind(-1)
+    return (torch.stack([x / roi.length, y / roi.width], dim=-1) + 0.5).view_as(points)
 
 
 def warp_bev(maps: Tensor, current_to_past: Tensor, roi: RegionOfInterest) -> Tensor:
@@ -60,3 +66,47 @@ def warp_bev(maps: Tensor, current_to_past: Tensor, roi: RegionOfInterest) -> Te
     past = move_points(cells, current_to_past, roi)
     grid = torch.stack([past[..., 0] * 2 - 1, 1 - past[..., 1] * 2], dim=-1).to(maps.dtype)
     return F.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+
+
+def invert_pose(pose: Tensor) -> Tensor:
+    """Invert rigid poses ``(..., 4, 4)`` in their own precision."""
+    turned_back = pose[..., :3, :3].transpose(-1, -2)
+    inverse = torch.zeros_like(pose)
+    inverse[..., :3, :3] = turned_back
+    inverse[..., :3, 3:] = -(turned_back @ pose[..., :3, 3:])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def relative_pose(a_to_global: Tensor, b_to_global: Tensor) -> Tensor:
+    """Return ``a_to_b (..., 4, 4) float64`` of two poses ``(..., 4, 4)``."""
+    return invert_pose(b_to_global).double() @ a_to_global.double()
+
+
+def quaternion(rotation: Tensor) -> Tensor:
+    """Turn rotation matrices into unit quaternions.
+
+    Args:
+        rotation: ``(..., 3, 3)``.
+
+    Returns:
+        ``(..., 4)`` as (x, y, z, w); the largest component is positive.
+    """
+    m = rotation
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    ww = xx + yy + zz
+    x, y, z = (m[..., i, j] - m[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    xy, yz, zx = (m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (1, 2), (2, 0)))
+    # Four times the outer product of the quaternion with itself; the row of the largest component is the most exact.
+    outer = torch.stack(
+        [
+            torch.stack([1 + xx - yy - zz, xy, zx, x], dim=-1),
+            torch.stack([xy, 1 - xx + yy - zz, yz, y], dim=-1),
+            torch.stack([zx, yz, 1 - xx - yy + zz, z], dim=-1),
+            torch.stack([x, y, z, 1 + ww], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = torch.stack([xx, yy, zz, ww], dim=-1).argmax(dim=-1)
+    row = outer.take_along_dim(largest[..., None, None], dim=-2).squeeze(-2)
+    return row / row.norm(dim=-1, keepdim=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -23,9 +25,9 @@ class MaskHead(nn.Module):
         self.embedding = Perceptron(width, width, config.masks.channels)
         self.bias = nn.Parameter(torch.tensor(-1.0))
 
-    def mask_features(self, fine: Tensor, middle: Tensor) -> Tensor:
-        """Return the features ``(B, C_m, H_m, W_m)`` that all queries are multiplied with."""
-        return self.features(middle if self.stride == 2 else fine)
+    def mask_features(self, levels: Sequence[Tensor]) -> Tensor:
+        """Return the features ``(B, C_m, H_m, W_m)`` that all queries are multiplied with, of levels fine to coarse."""
+        return self.features(levels[1] if self.stride == 2 else levels[0])
 
     def forward(self, queries: Tensor, mask_features: Tensor) -> Tensor:
         """Return mask logits ``(B, R, H_m, W_m)`` of queries ``(B, R, C)``."""

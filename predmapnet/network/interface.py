@@ -3,8 +3,8 @@
 ``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
 ``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
 (row 0 is the largest y, column 0 the smallest x), ``H_m x W_m`` the grid of instance masks and history maps over the
-same ROI (``config.mask_size``: 25 x 50 in the lite preset). Points are normalised to ``[0, 1]`` over the ROI: x
-forward, y left.
+same ROI (``config.mask_size``: 25 x 50 in the lite preset; 0 x 0 where no module needs masks). Points are normalised to
+``[0, 1]`` over the ROI: x forward, y left.
 """
 
 from __future__ import annotations
@@ -14,13 +14,19 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from predmapnet.network.camera_pillars import CameraPillars
+from predmapnet.network.view_transform import RigLookup
+
+RigGeometry = RigLookup | CameraPillars
+"""What is computed once per camera rig: a look-up for the BEV encoder ``lookup``, pillars for ``bevformer``."""
+
 
 @dataclass
 class FrameInputs:
     """One instant of ``B`` streams that share a camera rig.
 
     Attributes:
-        images: ``(B, N, 3, h, w) float32``, RGB, normalised.
+        images: ``(B, N, 3, h, w) float32``, as :func:`predmapnet.network.image_input.normalise_images` makes them.
         camera_valid: ``(B, N) bool``; False masks a missing or late camera out.
         ego_to_global: ``(B, 4, 4) float64``.
     """
@@ -85,6 +91,25 @@ class LostTracks:
 
 
 @dataclass
+class VectorMemory:
+    """What the tracks were in past frames; rows are the tracks of the state, the newest of ``K`` entries is the last.
+
+    A decoder without such a memory leaves it with no entries (``K = 0``).
+
+    Attributes:
+        queries: ``(B, T, K, C)``, embeddings of the last decoder layer.
+        poses: ``(B, T, K, 4, 4)``, ego to global, when each entry was made.
+        frames: ``(B, T, K) int64``, number of that frame within its log.
+        valid: ``(B, T, K) bool``; the valid entries are the last ones.
+    """
+
+    queries: Tensor
+    poses: Tensor
+    frames: Tensor
+    valid: Tensor
+
+
+@dataclass
 class StreamState:
     """Everything the network remembers between two frames; nothing is hidden in a module.
 
@@ -96,10 +121,12 @@ class StreamState:
         point_history_valid: ``(B, T, n) bool``.
         forecasts: ``(B, T, P, 2)``, where each track is expected in the next ego frame, normalised.
         next_track_id: ``(B,) int64``.
+        frame: ``(B,) int64``, number of the next frame within its log.
         ego_to_global: ``(B, 4, 4) float64`` of the last frame.
         bev_memory: ``(B, K, C_bev, H, W)``, past BEV maps (newest last).
         bev_memory_pose: ``(B, K, 4, 4) float64``.
-        bev_memory_valid: ``(B, K) bool``.
+        bev_memory_valid: ``(B, K) bool``; the valid ones are the last ones.
+        vector_memory: of the tracks.
         lost: tracks that may come back, or None where nobody keeps them.
     """
 
@@ -109,28 +136,35 @@ class StreamState:
     point_history_valid: Tensor
     forecasts: Tensor
     next_track_id: Tensor
+    frame: Tensor
     ego_to_global: Tensor
     bev_memory: Tensor
     bev_memory_pose: Tensor
     bev_memory_valid: Tensor
+    vector_memory: VectorMemory
     lost: LostTracks | None = None
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the state as named tensors, to be saved (safetensors) and read back by :meth:`from_tensors`."""
         named = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
-        named |= {f"instances.{name}": value for name, value in vars(self.instances).items()}
-        lost = {} if self.lost is None else vars(self.lost)
-        return named | {f"lost.{name}": value for name, value in lost.items()}
+        for part in ("instances", "vector_memory", "lost"):
+            value = getattr(self, part)
+            named |= {} if value is None else {f"{part}.{name}": field for name, field in vars(value).items()}
+        return named
 
     @classmethod
     def from_tensors(cls, named: Mapping[str, Tensor]) -> StreamState:
         """Make the state that :meth:`tensors` named."""
-        parts: dict[str, dict[str, Tensor]] = {"": {}, "instances": {}, "lost": {}}
+        parts: dict[str, dict[str, Tensor]] = {"": {}, "instances": {}, "vector_memory": {}, "lost": {}}
         for name, value in named.items():
             part, _, field = name.rpartition(".")
             parts[part][field] = value
-        lost = LostTracks(**parts["lost"]) if parts["lost"] else None
-        return cls(instances=Instances(**parts["instances"]), lost=lost, **parts[""])
+        return cls(
+            instances=Instances(**parts["instances"]),
+            vector_memory=VectorMemory(**parts["vector_memory"]),
+            lost=LostTracks(**parts["lost"]) if parts["lost"] else None,
+            **parts[""],
+        )
 
 
 @dataclass
@@ -158,7 +192,7 @@ class FrameOutputs:
         row_valid: ``(B, T + Q) bool``; False for padded track rows.
         row_track_ids: ``(B, T + Q) int64``; -1 for detections.
         segmentation: ``(B, 3, H_s, W_s)`` logits.
-        bev: ``(B, C_bev, H, W)``, raw BEV features that go into the memory.
+        bev: ``(B, C_bev, H, W)``, BEV features that go into the memory.
         ego_to_global: ``(B, 4, 4) float64``, pose of the instant.
         depth: ``(B, N, D, h', w')`` logits of the auxiliary head, or None.
         warped_history: ``(B, T, H_m, W_m)``, history maps of the track rows in this frame's ego frame, or None.
@@ -176,19 +210,32 @@ class FrameOutputs:
 
 
 @dataclass
-class BevFeatures:
-    """What the images of one instant say of the ground, before any memory: all that a frozen-BEV stage caches.
+class ImageFeatures:
+    """What the image backbone makes of the images of one instant.
 
     Attributes:
-        fine: ``(B, C_0, H, W)``.
-        middle: ``(B, C_1, H / 2, W / 2)`` (rounded up).
-        coarse: ``(B, C_2, H / 4, W / 4)`` (rounded up).
+        levels: ``(B, N, C, h_i, w_i)`` each, fine to coarse.
+        depth: ``(B, N, D, h_0, w_0)`` logits of the auxiliary head, in training where it is switched on; else None.
+    """
+
+    levels: list[Tensor]
+    depth: Tensor | None = None
+
+
+@dataclass
+class BevFeatures:
+    """What the images of one instant say of the ground.
+
+    With the BEV encoder ``lookup`` it is all that can be known before any memory, and what a frozen-BEV stage caches.
+    With ``bevformer`` past BEV maps are in it.
+
+    Attributes:
+        levels: fine to coarse: ``(B, C_0, H, W)``; unless nothing asks for it, ``(B, C_1, H / 2, W / 2)`` and
+            ``(B, C_2, H / 4, W / 4)`` (rounded up).
         depth: logits of the auxiliary head, or None.
     """
 
-    fine: Tensor
-    middle: Tensor
-    coarse: Tensor
+    levels: list[Tensor]
     depth: Tensor | None = None
 
 

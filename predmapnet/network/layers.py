@@ -75,6 +75,20 @@ class FeedForward(nn.Module):
         return self.norm(tokens + self.perceptron(tokens))
 
 
+class ResidualPerceptron(nn.Module):
+    """Two linear layers with ReLU between them, and the input."""
+
+    def __init__(self, width: int, hidden: int, dropout: float) -> None:
+        super().__init__()
+        self.first = Linear(width, hidden)
+        self.second = Linear(hidden, width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Map ``(..., C)`` to ``(..., C)``."""
+        return tokens + self.dropout(self.second(self.dropout(torch.relu(self.first(tokens)))))
+
+
 class Pointwise(Linear):
     """A 1x1 convolution as the matrix product that it is."""
 

@@ -7,7 +7,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.config import DecoderConfig, PredMapNetConfig
+from predmapnet.config import PointDecoderConfig, PredMapNetConfig
+from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.layers import Attention, FeedForward, Perceptron, Pointwise, sine_code, zero_init
 
 FREQUENCIES = 6
@@ -31,7 +32,7 @@ class PointMixing(nn.Module):
 class PointLayer(nn.Module):
     """One refinement of all queries and of all their points."""
 
-    def __init__(self, config: DecoderConfig, roi: RegionOfInterest) -> None:
+    def __init__(self, config: PointDecoderConfig, roi: RegionOfInterest) -> None:
         super().__init__()
         width, point_width = config.width, config.point_width
         self.register_buffer("roi_size", torch.tensor([roi.length, roi.width]), persistent=False)
@@ -95,28 +96,24 @@ class PointLayer(nn.Module):
         return self.place(torch.cat([sine_code(references, FREQUENCIES), steps], dim=-1))
 
 
-class MapDecoder(nn.Module):
-    """Layers of point refinement over the finest BEV level; references are detached between layers."""
+class MapDecoder(RowDecoder):
+    """Layers of point refinement over the finest BEV level; references are detached before each layer."""
+
+    learns_start = False
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        self.input = Pointwise(config.bev.widths[0], config.decoder.point_width)
-        self.layers = nn.ModuleList(PointLayer(config.decoder, config.roi) for _ in range(config.decoder.layers))
+        decoder = config.decoder
+        assert isinstance(decoder, PointDecoderConfig)
+        self.one_way = config.tracking.query_assignment == "one_way"
+        self.input = Pointwise(config.bev.widths[0], decoder.point_width)
+        self.layers = nn.ModuleList(PointLayer(decoder, config.roi) for _ in range(decoder.layers))
 
-    def forward(
-        self, queries: Tensor, references: Tensor, bev: Tensor, allowed: Tensor
-    ) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode.
-
-        Args:
-            queries: ``(B, R, C)``.
-            references: ``(B, R, P, 2)``, normalised.
-            bev: ``(B, C_0, H, W)``.
-            allowed: ``(B, R, R) bool``.
-
-        Returns:
-            The last embedding ``(B, R, C)``, and logits and points of each layer.
-        """
+    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Decode, as :class:`RowDecoder` says."""
+        queries, references = start.queries, start.points
+        detections = queries.shape[1] - start.track_valid.shape[1]
+        allowed = visible_rows(start.track_valid, detections, self.one_way)
         values = self.input(bev)
         hidden = None
         predictions = []

@@ -3,44 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from predmapnet.network.bevformer import ResidualPerceptron
+from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
+from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.deformable_attention import deformable_attention
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.layers import ResidualPerceptron
 from predmapnet.network.matrix_product import Linear
 from predmapnet.network.vector_memory import Recalled
-
-
-@dataclass
-class DecoderRows:
-    """What the decoder starts from; rows are ``T`` tracks, then ``Q`` detections.
-
-    Attributes:
-        queries: ``(B, T + Q, C)``.
-        points: ``(B, T + Q, P, 2)``, normalised reference points.
-        valid: ``(B, T + Q) bool``; False for padded track rows.
-        memory: of the track rows.
-        first_frame: ``(B) bool``, the stream has no past.
-    """
-
-    queries: Tensor
-    points: Tensor
-    valid: Tensor
-    memory: Recalled
-    first_frame: Tensor
 
 
 class LineCrossAttention(nn.Module):
     """Deformable attention of rows to the BEV map: every head looks around each point of the row's line once."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: MapTrackerDecoderConfig, grid: tuple[int, int]) -> None:
         super().__init__()
-        width, self.heads = config.decoder_width, config.decoder_heads
-        self.grid = (config.rows, config.columns)
+        width, self.heads = config.width, config.heads
+        self.grid = grid
         samples = self.heads * config.points
         self.sampling_offsets = nn.Linear(width, 2 * samples)
         self.attention_weights = nn.Linear(width, samples)
@@ -81,7 +62,7 @@ class LineCrossAttention(nn.Module):
 class MemoryAttention(nn.Module):
     """Attention of each track to its own recalled queries."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: MapTrackerDecoderConfig) -> None:
         super().__init__()
         self.attention = _multihead(config)
         self.dropout = nn.Dropout(config.dropout)
@@ -99,7 +80,7 @@ class MemoryAttention(nn.Module):
 class RowSelfAttention(nn.Module):
     """Attention of all rows to each other."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: MapTrackerDecoderConfig) -> None:
         super().__init__()
         self.attention = _multihead(config)
         self.dropout = nn.Dropout(config.dropout)
@@ -113,15 +94,14 @@ class RowSelfAttention(nn.Module):
 class MapTrackerDecoderLayer(nn.Module):
     """Self-attention, BEV attention, memory attention and a perceptron."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    def __init__(self, config: MapTrackerDecoderConfig, grid: tuple[int, int], norm_before: bool) -> None:
         super().__init__()
-        width = config.decoder_width
-        self.norm_before = config.quirks.norm_before_cross_attention
+        self.norm_before = norm_before
         self.self_attention = RowSelfAttention(config)
-        self.bev_attention = LineCrossAttention(config)
+        self.bev_attention = LineCrossAttention(config, grid)
         self.memory_attention = MemoryAttention(config)
-        self.perceptron = ResidualPerceptron(width, config.decoder_hidden, config.dropout)
-        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(4))
+        self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(4))
 
     def forward(self, rows: Tensor, points: Tensor, start: DecoderRows, cells: Tensor) -> Tensor:
         """Refine.
@@ -141,24 +121,30 @@ class MapTrackerDecoderLayer(nn.Module):
             rows = self._with_memory(self.norms[1](seen), start.memory)
         return self.norms[3](self.perceptron(self.norms[2](rows)))
 
-    def _with_memory(self, rows: Tensor, memory: Recalled) -> Tensor:
+    def _with_memory(self, rows: Tensor, memory: Recalled | None) -> Tensor:
         """Replace the track rows, the first ones, by what their memory makes of them."""
+        assert memory is not None
         tracks = memory.queries.shape[1]
         if tracks == 0:
             return rows
         return torch.cat([self.memory_attention(rows[:, :tracks], memory), rows[:, tracks:]], dim=1)
 
 
-class MapTrackerDecoder(nn.Module):
+class MapTrackerDecoder(RowDecoder):
     """All layers, with one classifier and one polyline branch for all of them."""
 
-    def __init__(self, config: MapTrackerConfig) -> None:
+    learns_start = True
+
+    def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        width = config.decoder_width
-        self.grid = (config.rows, config.columns)
-        self.input = nn.Conv2d(config.bev_width, width, 1)
-        self.layers = nn.ModuleList(MapTrackerDecoderLayer(config) for _ in range(config.decoder_layers))
-        self.classify = nn.Linear(width, config.classes)
+        decoder, self.grid = config.decoder, (config.bev.rows, config.bev.columns)
+        assert isinstance(decoder, MapTrackerDecoderConfig)
+        width, norm_before = decoder.width, config.quirks.norm_before_cross_attention
+        self.input = nn.Conv2d(config.bev.widths[0], width, 1)
+        self.layers = nn.ModuleList(
+            MapTrackerDecoderLayer(decoder, self.grid, norm_before) for _ in range(decoder.layers)
+        )
+        self.classify = nn.Linear(width, decoder.classes)
         self.line = nn.Sequential(
             nn.Linear(width, 2 * width),
             nn.LayerNorm(2 * width),
@@ -166,20 +152,11 @@ class MapTrackerDecoder(nn.Module):
             nn.Linear(2 * width, 2 * width),
             nn.LayerNorm(2 * width),
             nn.ReLU(),
-            nn.Linear(2 * width, 2 * config.points),
+            nn.Linear(2 * width, 2 * decoder.points),
         )
 
     def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode.
-
-        Args:
-            start: rows to begin with.
-            bev: ``(B, C_bev, H, W)``.
-
-        Returns:
-            Embeddings ``(B, T + Q, C)`` of the last layer, and of every layer the logits ``(B, T + Q, classes)`` and
-            the normalised polylines ``(B, T + Q, P, 2)``.
-        """
+        """Decode, as :class:`RowDecoder` says."""
         cells = self.bev_cells(bev)
         rows, points, predictions = start.queries, start.points, []
         for layer in self.layers:
@@ -214,5 +191,5 @@ def position_code(channels: int, grid: tuple[int, int], device: torch.device) ->
     return torch.cat([row, column])
 
 
-def _multihead(config: MapTrackerConfig) -> nn.MultiheadAttention:
-    return nn.MultiheadAttention(config.decoder_width, config.decoder_heads, dropout=config.dropout, batch_first=True)
+def _multihead(config: MapTrackerDecoderConfig) -> nn.MultiheadAttention:
+    return nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from predmapnet.network.rigid_motion import quaternion
+from predmapnet.network.ego_motion import quaternion
 
 OCTAVES = 10
 POSE_NUMBERS = 7

@@ -5,9 +5,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import (
+    BevFormerConfig,
+    EncoderBevMemoryConfig,
+    MapTrackerDecoderConfig,
+    PredMapNetConfig,
+    ResidualBevMemoryConfig,
+    ResNet50Config,
+)
 from predmapnet.datasets.source import Rig
 from predmapnet.network.bev_encoder import BevEncoder
+from predmapnet.network.bev_history import keep_map
+from predmapnet.network.bev_pyramid import BevPyramid
+from predmapnet.network.bevformer import BevFormer
+from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
@@ -19,23 +30,33 @@ from predmapnet.network.interface import (
     BevFeatures,
     FrameInputs,
     FrameOutputs,
+    ImageFeatures,
     Instances,
     LayerPredictions,
     LostTracks,
+    RigGeometry,
     StreamState,
+    VectorMemory,
 )
-from predmapnet.network.map_decoder import MapDecoder, visible_rows
+from predmapnet.network.map_decoder import MapDecoder
+from predmapnet.network.maptracker_decoder import MapTrackerDecoder
+from predmapnet.network.resnet import ResNet50Pyramid
 from predmapnet.network.revival import recall, still_lost
-from predmapnet.network.segmentation_head import SegmentationHead
+from predmapnet.network.rig_geometry import make_rig_geometry
+from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
 from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
 from predmapnet.network.temporal_bev import TemporalBevFusion, empty_memory, remember_bev
-from predmapnet.network.track_memory import memory_of_tracks
-from predmapnet.network.track_propagation import TrackPropagation
-from predmapnet.network.view_transform import RigLookup, make_rig_lookup, to_ground
+from predmapnet.network.track_memory import match_tracks, memory_of_tracks
+from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
+from predmapnet.network.vector_memory import empty_vector_memory, remember
 
 
 class PredMapNet(nn.Module):
     """The network of the paper, one instant at a time; all memory is in the :class:`StreamState` that goes in and out.
+
+    The baseline (image backbone, BEV encoder, map decoder, propagation) comes in two sizes that share their
+    interfaces; the paper's modules are the same on both, each with its switch. All switches off on MapTracker's
+    baseline is MapTracker.
 
     One step of a stream::
 
@@ -47,25 +68,42 @@ class PredMapNet(nn.Module):
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
         self.config = config
-        fine = config.bev.widths[0]
-        self.image_backbone = ImageBackbone(config.backbone)
-        self.bev_encoder = BevEncoder(config.backbone.channels, config.bev)
-        self.segmentation_head = SegmentationHead(fine, config.decoder.classes)
+        fine, classes = config.bev.widths[0], config.decoder.classes
+        self.image_backbone = (
+            ResNet50Pyramid(config.backbone)
+            if isinstance(config.backbone, ResNet50Config)
+            else ImageBackbone(config.backbone)
+        )
+        self.bev_encoder = (
+            BevFormer(config)
+            if isinstance(config.bev, BevFormerConfig)
+            else BevEncoder(config.backbone.channels, config.bev)
+        )
+        self.segmentation_head = (
+            UpsamplingSegmentationHead(fine, classes)
+            if config.segmentation.kind == "upsampling"
+            else SegmentationHead(fine, classes)
+        )
         self.query_generator = SemanticAwareQueryGenerator(config)
-        self.map_decoder = MapDecoder(config)
-        self.propagation = TrackPropagation(config)
+        maptracker = isinstance(config.decoder, MapTrackerDecoderConfig)
+        self.map_decoder: RowDecoder = MapTrackerDecoder(config) if maptracker else MapDecoder(config)
+        self.propagation = PoseTrackPropagation(config) if maptracker else TrackPropagation(config)
         needs_masks = config.semantic_queries.enabled or config.history_map.memory
         self.mask_head = MaskHead(config) if needs_masks else None
         self.history_memory = HistoryRasterMapMemory(config.history_map, config.roi)
         self.history_guidance = HistoryMapGuidance(config) if config.history_map.guidance else None
         self.future_guidance = ShortTermFutureGuidance(config) if config.future.enabled else None
-        self.temporal_bev = TemporalBevFusion(config) if config.temporal_bev.enabled else None
+        memory = config.temporal_bev
+        residual = isinstance(memory, ResidualBevMemoryConfig) and memory.enabled
+        self.temporal_bev = TemporalBevFusion(config) if residual else None
+        needs_pyramid = isinstance(config.bev, BevFormerConfig) and config.semantic_queries.enabled
+        self.bev_pyramid = BevPyramid(config.bev.widths) if needs_pyramid else None
         self.depth_head = DepthHead(config.backbone.channels, config.depth) if config.depth.enabled else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def make_rig_lookup(self, rig: Rig) -> RigLookup:
-        """Precompute the view transform of a rig (cameras at the size of their stored images)."""
-        return make_rig_lookup(rig, self.config).to(self.query_generator.content.device)
+    def make_rig_lookup(self, rig: Rig) -> RigGeometry:
+        """Precompute where a rig sees the ground (cameras at the size of their stored images)."""
+        return make_rig_geometry(rig, self.config).to(self.query_generator.content.device)
 
     def initial_state(self, batch: int) -> StreamState:
         """Return the state before the first frame of ``batch`` streams: no tracks, nothing remembered."""
@@ -73,7 +111,7 @@ class PredMapNet(nn.Module):
         points, histories = config.decoder.points, config.future.histories
         floats, integers = torch.zeros(batch, 0, device=device), torch.zeros(batch, 0, dtype=torch.int64, device=device)
         maps, poses, valid = empty_memory(batch, config, device)
-        masks = torch.zeros(batch, 0, *config.mask_size, device=device)
+        masks = torch.zeros(batch, 0, *(config.mask_size if self.mask_head is not None else (0, 0)), device=device)
         polylines = torch.zeros(batch, 0, points, 2, device=device)
         instances = Instances(
             valid=floats.bool(),
@@ -92,13 +130,15 @@ class PredMapNet(nn.Module):
             point_history_valid=torch.zeros(batch, 0, histories, dtype=torch.bool, device=device),
             forecasts=polylines,
             next_track_id=torch.zeros(batch, dtype=torch.int64, device=device),
+            frame=torch.zeros(batch, dtype=torch.int64, device=device),
             ego_to_global=torch.eye(4, dtype=torch.float64, device=device).expand(batch, 4, 4).clone(),
             bev_memory=maps,
             bev_memory_pose=poses,
             bev_memory_valid=valid,
+            vector_memory=empty_vector_memory(batch, config, device),
         )
 
-    def forward(self, inputs: FrameInputs, lookup: RigLookup, state: StreamState | None = None) -> FrameOutputs:
+    def forward(self, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None) -> FrameOutputs:
         """Map one instant of ``B`` streams.
 
         Args:
@@ -106,86 +146,114 @@ class PredMapNet(nn.Module):
             lookup: of the rig that took the images.
             state: of the last frame; None or an empty state makes it a single-frame network.
         """
-        return self.decode_bev(self.encode_bev(inputs, lookup), inputs, state)
+        return self.decode_bev(self.encode_bev(self.encode_images(inputs), inputs, lookup, state), inputs, state)
 
-    def encode_bev(self, inputs: FrameInputs, lookup: RigLookup) -> BevFeatures:
-        """From images to BEV features, without any memory: the part that can be frozen and cached."""
-        batch, cameras = inputs.images.shape[:2]
-        # What a masked camera saw must not reach anything, batch statistics included.
+    def encode_images(self, inputs: FrameInputs) -> ImageFeatures:
+        """From images to image features: no memory and no geometry yet."""
+        batch = len(inputs.images)
+        # What a masked camera saw must not reach anything: not batch statistics, not even as not-a-number.
         images = inputs.images.masked_fill(~inputs.camera_valid[:, :, None, None, None], 0.0)
-        features = self.image_backbone(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-        depth = None if self.depth_head is None else self.depth_head(features).unflatten(0, (batch, cameras))
-        ground = to_ground(features.unflatten(0, (batch, cameras)), inputs.camera_valid, lookup)
-        fine, middle, coarse = self.bev_encoder(ground)
-        return BevFeatures(fine, middle, coarse, depth)
+        levels = self.image_backbone(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+        depth = None
+        if self.depth_head is not None and self.training:
+            depth = self.depth_head(levels[0]).unflatten(0, (batch, -1))
+        return ImageFeatures([level.unflatten(0, (batch, -1)) for level in levels], depth)
+
+    def encode_bev(
+        self, images: ImageFeatures, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None
+    ) -> BevFeatures:
+        """From image features to BEV features; with the encoder ``bevformer`` the BEV memory takes part.
+
+        Args:
+            images: of :meth:`encode_images`.
+            inputs: which cameras count, and poses.
+            lookup: of the rig that took the images.
+            state: of the last frame.
+        """
+        if state is None:
+            state = self.initial_state(len(inputs.camera_valid))
+        levels = self.bev_encoder(images.levels, inputs, lookup, state)
+        if self.bev_pyramid is not None:
+            levels = self.bev_pyramid(levels[0])
+        return BevFeatures(levels, images.depth)
 
     def decode_bev(self, bev: BevFeatures, inputs: FrameInputs, state: StreamState | None = None) -> FrameOutputs:
         """From BEV features and memory to map instances; of ``inputs`` only the poses are used."""
-        fine, middle, raw = bev.fine, bev.middle, bev.fine.new_zeros(len(bev.fine), 0, *bev.fine.shape[-2:])
-        if self.temporal_bev is not None:
-            raw = self.temporal_bev.compress(bev.fine)
-            if state is not None:
-                fine, middle = self.temporal_bev(fine, middle, raw, inputs.ego_to_global, state)
+        levels, remembered = self._with_past_maps(bev.levels, inputs.ego_to_global, state)
         if state is None:
-            state = self.initial_state(len(bev.fine))
+            state = self.initial_state(len(levels[0]))
+        mask_features = None if self.mask_head is None else self.mask_head.mask_features(levels)
+        detections = self.query_generator(levels[::-1], mask_features, self.mask_head)
+        tracks, history = self._track_rows(state, inputs.ego_to_global, levels)
+        start = DecoderRows(
+            queries=torch.cat([tracks.queries, detections.queries], dim=1),
+            points=torch.cat([tracks.points, detections.points], dim=1),
+            track_valid=tracks.valid,
+            memory=tracks.memory,
+            first_frame=state.frame == 0,
+        )
+        embedding, refined = self.map_decoder(start, levels[0])
 
-        mask_features = None if self.mask_head is None else self.mask_head.mask_features(fine, middle)
-        detections = self.query_generator([bev.coarse, middle, fine], mask_features, self.mask_head)
-
-        tracks, references, valid, history = self._track_rows(state, inputs.ego_to_global, fine, middle)
-        queries = torch.cat([tracks, detections.queries], dim=1)
-        one_way = self.config.tracking.query_assignment == "one_way"
-        allowed = visible_rows(valid, detections.queries.shape[1], one_way)
-        embedding, refined = self.map_decoder(queries, torch.cat([references, detections.points], dim=1), fine, allowed)
-
-        layers = self._generator_layers(detections, tracks, references, mask_features)
+        layers = self._generator_layers(detections, tracks, mask_features)
         layers += [LayerPredictions(logits, points, None) for logits, points in refined]
         if self.mask_head is not None and mask_features is not None:
             layers[-1].masks = self.mask_head(embedding, mask_features)
-        detection_rows = valid.new_ones(len(valid), self.config.decoder.queries)
+        no_id = state.instances.track_ids.new_full(detections.queries.shape[:2], -1)
         return FrameOutputs(
             layers=layers,
             queries=embedding,
-            row_valid=torch.cat([valid, detection_rows], dim=1),
-            row_track_ids=torch.cat([state.instances.track_ids, detection_rows.long().neg()], dim=1),
-            segmentation=self.segmentation_head(fine),
-            bev=raw,
+            row_valid=start.valid,
+            row_track_ids=torch.cat([state.instances.track_ids, no_id], dim=1),
+            segmentation=self.segmentation_head(levels[0]),
+            bev=remembered,
             ego_to_global=inputs.ego_to_global,
             depth=bev.depth,
             warped_history=history,
         )
 
+    def _with_past_maps(
+        self, levels: list[Tensor], ego_to_global: Tensor, state: StreamState | None
+    ) -> tuple[list[Tensor], Tensor]:
+        """Return the levels with what past maps add to finished BEV features, and the map to be remembered."""
+        fine = levels[0]
+        if isinstance(self.config.temporal_bev, EncoderBevMemoryConfig):
+            return levels, fine
+        if self.temporal_bev is None:
+            return levels, fine.new_zeros(len(fine), 0, *fine.shape[-2:])
+        raw = self.temporal_bev.compress(fine)
+        if state is None:
+            return levels, raw
+        return [*self.temporal_bev(fine, levels[1], raw, ego_to_global, state), *levels[2:]], raw
+
     def _track_rows(
-        self, state: StreamState, ego_to_global: Tensor, fine: Tensor, middle: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Propagate the tracks of the last frame: queries, references, validity and aligned history maps."""
-        past_to_current = relative_motion(state.ego_to_global, ego_to_global)
-        queries, references, valid = self.propagation(state.instances, past_to_current)
+        self, state: StreamState, ego_to_global: Tensor, levels: list[Tensor]
+    ) -> tuple[CarriedTracks, Tensor]:
+        """Carry the tracks of the last frame and guide them by their past and future; also return aligned maps."""
+        tracks, history = self.propagation(state, ego_to_global), state.history_maps
         if self.future_guidance is not None:
-            queries = self.future_guidance(queries, state.forecasts)
-        history = state.history_maps
+            tracks.queries = self.future_guidance(tracks.queries, state.forecasts)
         if self.config.history_map.memory:
             history = self.history_memory.align(history, relative_motion(ego_to_global, state.ego_to_global))
         if self.history_guidance is not None:
-            level = middle if self.config.masks.stride == 2 else fine
-            queries = self.history_guidance(queries, state.instances.labels, history, level)
-        return queries, references, valid, history
+            level = levels[1] if self.config.masks.stride == 2 else levels[0]
+            tracks.queries = self.history_guidance(tracks.queries, state.instances.labels, history, level)
+        return tracks, history
 
     def _generator_layers(
-        self, detections: GeneratedQueries, tracks: Tensor, references: Tensor, mask_features: Tensor | None
+        self, detections: GeneratedQueries, tracks: CarriedTracks, mask_features: Tensor | None
     ) -> list[LayerPredictions]:
         """Predictions of the query generator; track rows say the same in all of them, the decoder's input."""
+        points = None if self.map_decoder.learns_start else torch.cat([tracks.points, detections.points], dim=1)
         if not detections.logits:
-            points = torch.cat([references, detections.points], dim=1)
-            return [LayerPredictions(None, points, None)]
+            return [] if points is None else [LayerPredictions(None, points, None)]
         assert mask_features is not None and self.mask_head is not None
-        track_logits = self.query_generator.classify(tracks)
-        track_masks = self.mask_head(tracks, mask_features)
+        track_logits = self.query_generator.classify(tracks.queries)
+        track_masks = self.mask_head(tracks.queries, mask_features)
         layers = [
             LayerPredictions(torch.cat([track_logits, logits], dim=1), None, torch.cat([track_masks, masks], dim=1))
             for logits, masks in zip(detections.logits, detections.masks, strict=True)
         ]
-        layers[-1].points = torch.cat([references, detections.points], dim=1)
+        layers[-1].points = points
         return layers
 
     def advance(
@@ -225,7 +293,7 @@ class PredMapNet(nn.Module):
         if self.future_guidance is not None:
             last_step = last_motion(state, inputs.ego_to_global)
             forecasts = self.future_guidance.forecast(history, history_valid, last_step)
-        maps, poses, valid = remember_bev(state, outputs.bev, inputs.ego_to_global, self.config.temporal_bev.spacing)
+        maps, poses, valid = self._remembered_maps(state, outputs.bev, inputs.ego_to_global)
         newest = torch.cat([instances.track_ids, state.next_track_id[:, None] - 1], dim=1).amax(dim=1)
         return StreamState(
             instances=instances,
@@ -234,12 +302,28 @@ class PredMapNet(nn.Module):
             point_history_valid=history_valid,
             forecasts=forecasts,
             next_track_id=newest + 1,
+            frame=state.frame + 1,
             ego_to_global=inputs.ego_to_global,
             bev_memory=maps,
             bev_memory_pose=poses,
             bev_memory_valid=valid,
+            vector_memory=self._remembered_queries(state, instances, inputs.ego_to_global),
             lost=None if lost is None else still_lost(lost, instances),
         )
+
+    def _remembered_maps(self, state: StreamState, bev: Tensor, ego_to_global: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        memory = self.config.temporal_bev
+        if isinstance(memory, EncoderBevMemoryConfig):
+            return keep_map(state, bev, ego_to_global, memory)
+        return remember_bev(state, bev, ego_to_global, memory.spacing)
+
+    def _remembered_queries(self, state: StreamState, instances: Instances, ego_to_global: Tensor) -> VectorMemory:
+        """Store the queries; tracks that came back begin anew, as their query does."""
+        memory = state.vector_memory
+        if memory.valid.shape[2] == 0:
+            return memory
+        source, matched = match_tracks(instances, state.instances)
+        return remember(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
 
 
 def last_motion(state: StreamState, ego_to_global: Tensor) -> Tensor:

@@ -1,11 +1,13 @@
-"""ResNet-50 as MapTracker uses it: caffe style, deformable in the last two stages."""
+"""Image features, large: ResNet-50 as MapTracker uses it (caffe style, deformable in the last two stages)."""
 
 from __future__ import annotations
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from predmapnet.config import ResNet50Config
 from predmapnet.network.deformable_convolution import DeformableConvolution
+from predmapnet.network.feature_pyramid import FeaturePyramid
 from predmapnet.network.normalised_convolution import NormalisedConvolution
 
 BLOCKS = (3, 4, 6, 3)
@@ -79,3 +81,16 @@ class ResNet50(nn.Module):
             features = stage(features)
             levels.append(features)
         return levels[1:]
+
+
+class ResNet50Pyramid(nn.Module):
+    """ResNet-50 and a feature pyramid over its levels."""
+
+    def __init__(self, config: ResNet50Config) -> None:
+        super().__init__()
+        self.resnet = ResNet50()
+        self.pyramid = FeaturePyramid(LEVEL_WIDTHS, config.channels)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        """Map ``(M, 3, h, w)`` to ``(M, channels, h / s, w / s)`` for the strides s = 8, 16 and 32."""
+        return self.pyramid(self.resnet(images))

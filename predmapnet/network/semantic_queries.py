@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import PointDecoderConfig, PredMapNetConfig
 from predmapnet.network.instance_masks import MaskHead, attention_cells
 from predmapnet.network.layers import Attention, FeedForward, Perceptron, cell_centres, flatten_cells, sine_code
 
@@ -72,7 +72,8 @@ class SemanticAwareQueryGenerator(nn.Module):
         self.threshold = config.semantic_queries.mask_threshold
         self.points = decoder.points
         self.content = nn.Parameter(torch.randn(decoder.queries, decoder.width))
-        self.first_guess = Perceptron(decoder.width, decoder.width, 2 * decoder.points)
+        hidden = [decoder.width] if isinstance(decoder, PointDecoderConfig) else []
+        self.first_guess = Perceptron(decoder.width, *hidden, 2 * decoder.points)
         if not self.enabled:
             return
         self.position = nn.Parameter(torch.randn(decoder.queries, decoder.width))
@@ -89,7 +90,7 @@ class SemanticAwareQueryGenerator(nn.Module):
         """Generate the detection queries of one instant.
 
         Args:
-            levels: BEV features ``(B, C_l, h_l, w_l)``, coarse to fine.
+            levels: BEV features ``(B, C_l, h_l, w_l)``, coarse to fine; switched off, their number does not matter.
             mask_features: ``(B, C_m, H_m, W_m)``; None if the generator is switched off.
             mask_head: shared with the tracks.
         """

@@ -1,11 +1,11 @@
-"""Memory of past BEV maps and their fusion into the current one (MapTracker's BEV memory, lighter)."""
+"""Past BEV maps as a residual of finished BEV features (MapTracker's BEV memory, lighter)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import PredMapNetConfig, ResidualBevMemoryConfig
 from predmapnet.network.ego_motion import relative_motion, warp_bev
 from predmapnet.network.interface import StreamState
 from predmapnet.network.layers import Pointwise, zero_init
@@ -19,6 +19,7 @@ class TemporalBevFusion(nn.Module):
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
+        assert isinstance(config.temporal_bev, ResidualBevMemoryConfig)
         self.config = config.temporal_bev
         self.roi = config.roi
         fine, middle, _ = config.bev.widths
@@ -108,9 +109,13 @@ def remember_bev(
 
 
 def empty_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return an empty BEV memory: maps, poses and validity; no slots at all if the module is switched off."""
-    temporal = config.temporal_bev
-    slots = temporal.capacity if temporal.enabled else 0
-    maps = torch.zeros(batch, slots, temporal.channels, config.bev.rows, config.bev.columns, device=device)
+    """Return an empty BEV memory: maps, poses and validity.
+
+    The residual fusion has a fixed number of slots, none if it is switched off; the encoder's memory grows.
+    """
+    temporal, slots, channels = config.temporal_bev, 0, config.bev.widths[0]
+    if isinstance(temporal, ResidualBevMemoryConfig):
+        slots, channels = temporal.capacity if temporal.enabled else 0, temporal.channels
+    maps = torch.zeros(batch, slots, channels, config.bev.rows, config.bev.columns, device=device)
     pose = torch.eye(4, dtype=torch.float64, device=device).expand(batch, slots, 4, 4).clone()
     return maps, pose, torch.zeros(batch, slots, dtype=torch.bool, device=device)

@@ -24,6 +24,9 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
     frames without support (``tau_t``); a detection above ``tau_d`` that nothing took up is born, with the id of a lost
     track if it is found to be one.
 
+    Without merging thresholds alone decide, as in the paper and in MapTracker: newborns are numbered in the order of
+    their queries, and a track that ends is still reported, as a detection.
+
     Args:
         outputs: of this frame.
         state: that went into it.
@@ -36,14 +39,15 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
     source, scores, alive = rows.rows[:, :tracks], rows.scores[:, :tracks], rows.valid[:, :tracks]
     free = rows.valid[:, tracks:]
     repeats = torch.zeros_like(alive)
+    confident = detection_scores > _birth_threshold(state, rules)
     if rules.merge:
         distances = _line_distances(outputs, rows, config.roi, rules)
         repeats = _has_older_twin(distances[:, :tracks, :tracks], rows.track_ids, rules)
         alive = alive & ~repeats
         source, scores, taken = _take_up(distances[:, :tracks, tracks:], rows, alive, rules)
         free = free & ~taken
-        free = free & ~_has_better_twin(distances[:, tracks:, tracks:], free & (detection_scores > rules.tau_d), rules)
-    born = free & (detection_scores > rules.tau_d)
+        free = free & ~_has_better_twin(distances[:, tracks:, tracks:], free & confident, rules)
+    born = free & confident
     misses = torch.where(scores > rules.tau_t, 0, rows.misses + 1)
     alive = alive & (misses <= rules.misses_allowed)
 
@@ -57,17 +61,32 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
         misses=torch.cat([misses, torch.zeros_like(new_ids)], dim=1),
         scores=torch.cat([scores, detection_scores], dim=1),
     )
-    no_id, no_misses = torch.full_like(new_ids, -1), torch.zeros_like(new_ids)
-    detections = _compact(outputs, detection_rows, free & ~born, no_id, no_misses, detection_scores)
+    others, reported, other_scores = detection_rows, free & ~born, detection_scores
+    if not rules.merge:
+        ended = rows.valid[:, :tracks] & ~alive & (scores > rules.report_threshold)
+        others, reported, other_scores = rows.rows, torch.cat([ended, reported], dim=1), rows.scores
+    no_id, no_misses = torch.full_like(others, -1), torch.zeros_like(others)
+    detections = _compact(outputs, others, reported, no_id, no_misses, other_scores)
     if state is None or not config.revival.enabled:
         return Selection(instances, detections)
     instances, lost = revive(instances, state, repeats, outputs.ego_to_global, config)
     return Selection(instances, detections, lost)
 
 
+def _birth_threshold(state: StreamState | None, rules: TrackingConfig) -> Tensor | float:
+    """Return the score above which a detection is born: one number, or ``(B, 1)`` where first frames have their own."""
+    if rules.first_tau_d is None:
+        return rules.tau_d
+    if state is None:
+        return rules.first_tau_d
+    return torch.where(state.frame == 0, rules.first_tau_d, rules.tau_d)[:, None]
+
+
 @dataclass
 class _Rows:
     """Rows that matter: all ``T`` tracks, then the ``D`` best detections in falling order of score.
+
+    Without merging, detections stay in the order of their queries.
 
     Attributes:
         rows: ``(B, T + D) int64``, rows of the outputs.
@@ -90,7 +109,10 @@ def _candidates(outputs: FrameOutputs, state: StreamState | None, rules: Trackin
     assert logits is not None
     tracks = 0 if state is None else state.instances.track_ids.shape[1]
     scores, labels = logits.sigmoid().max(dim=-1)
-    ranked, order = scores[:, tracks:].sort(dim=1, descending=True, stable=True)
+    detections = scores[:, tracks:]
+    rank = -detections if rules.merge else (detections <= rules.report_threshold).int()
+    order = rank.argsort(dim=1, stable=True)
+    ranked = detections.gather(1, order)
     # At least one column, so that nothing below has to think of none.
     count = max(1, int((ranked > rules.report_threshold).sum(dim=1).max()))
     track_rows = torch.arange(tracks, device=scores.device).expand(len(scores), tracks)

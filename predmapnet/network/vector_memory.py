@@ -3,32 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
+from predmapnet.network.ego_motion import relative_pose
 from predmapnet.network.history_choice import choose_history
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.interface import VectorMemory
 from predmapnet.network.motion_mlp import MotionMlp, pose_vector
-from predmapnet.network.rigid_motion import relative_pose
-
-
-@dataclass
-class VectorMemory:
-    """What the tracks were in past frames; rows are the tracks of the state, the newest entry is the last.
-
-    Attributes:
-        queries: ``(B, T, K, C)``, embeddings of the last decoder layer.
-        poses: ``(B, T, K, 4, 4)``, ego to global, when each entry was made.
-        frames: ``(B, T, K) int64``, number of that frame within its log.
-        valid: ``(B, T, K) bool``; the valid entries are the last ones.
-    """
-
-    queries: Tensor
-    poses: Tensor
-    frames: Tensor
-    valid: Tensor
 
 
 @dataclass
@@ -50,12 +35,13 @@ class Recalled:
     pose: Tensor
 
 
-def empty_vector_memory(batch: int, config: MapTrackerConfig, device: torch.device) -> VectorMemory:
-    """Return a memory without tracks."""
-    shape = (batch, 0, config.history_capacity)
+def empty_vector_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> VectorMemory:
+    """Return a memory without tracks, and without any entry for a decoder that does not read it."""
+    decoder = config.decoder
+    shape = (batch, 0, decoder.memory_capacity if isinstance(decoder, MapTrackerDecoderConfig) else 0)
     precision = torch.float32 if config.quirks.single_precision_memory_poses else torch.float64
     return VectorMemory(
-        queries=torch.zeros(*shape, config.decoder_width, device=device),
+        queries=torch.zeros(*shape, decoder.width, device=device),
         poses=torch.zeros(*shape, 4, 4, dtype=precision, device=device),
         frames=torch.zeros(shape, dtype=torch.int64, device=device),
         valid=torch.zeros(shape, dtype=torch.bool, device=device),
@@ -63,7 +49,7 @@ def empty_vector_memory(batch: int, config: MapTrackerConfig, device: torch.devi
 
 
 def recall(
-    memory: VectorMemory, motion: MotionMlp, ego_to_global: Tensor, frame: Tensor, config: MapTrackerConfig
+    memory: VectorMemory, motion: MotionMlp, ego_to_global: Tensor, frame: Tensor, distances: Sequence[float]
 ) -> Recalled:
     """Choose entries of each track by distance and carry them into the current ego frame.
 
@@ -72,12 +58,12 @@ def recall(
         motion: carries queries.
         ego_to_global: ``(B, 4, 4) float64``, current.
         frame: ``(B,) int64``, number of the current frame.
-        config: distances.
+        distances: metres back at which entries are chosen.
     """
     # Released weights know the noise that rounded global coordinates leave in the finest sines of the motion code.
     current = ego_to_global.to(memory.poses.dtype)[:, None, None]
     travelled = (memory.poses[..., :2, 3] - current[..., :2, 3]).norm(dim=-1)
-    slots, valid = choose_history(travelled, memory.valid, config.history_distances, fallback="nearest")
+    slots, valid = choose_history(travelled, memory.valid, distances, fallback="nearest")
     first = (~valid).int().argsort(dim=-1, stable=True)
     slots, valid = slots.gather(-1, first), valid.gather(-1, first)
 
@@ -101,6 +87,7 @@ def remember(
     memory: VectorMemory,
     queries: Tensor,
     source: Tensor,
+    matched: Tensor,
     ego_to_global: Tensor,
     frame: Tensor,
     valid: Tensor,
@@ -110,22 +97,22 @@ def remember(
     Args:
         memory: of the last frame.
         queries: ``(B, T', C)`` of the tracks that live on.
-        source: ``(B, T') int64``, their row in ``memory``; -1 for newborn ones.
+        source: ``(B, T') int64``, their row in ``memory``.
+        matched: ``(B, T') bool``, whether they have one; newborn ones do not.
         ego_to_global: ``(B, 4, 4) float64``, current.
         frame: ``(B,) int64``, number of the current frame.
         valid: ``(B, T') bool``, False in padded rows.
     """
-    born = source < 0
 
     def shifted(entries: Tensor, newest: Tensor) -> Tensor:
-        kept = entries.take_along_dim(source.clamp(min=0).view(*source.shape, *[1] * (entries.ndim - 2)), dim=1)
+        kept = entries.take_along_dim(source.view(*source.shape, *[1] * (entries.ndim - 2)), dim=1)
         return torch.cat([kept[:, :, 1:], newest[:, :, None].to(entries.dtype)], dim=2)
 
     if memory.valid.shape[1] == 0:  # A row to take from, for newborn tracks.
         memory = VectorMemory(**{name: _one_row(entries) for name, entries in vars(memory).items()})
     rows = queries.shape[1]
     kept_valid = shifted(memory.valid, valid)
-    kept_valid[:, :, :-1] &= ~(born | ~valid)[..., None]
+    kept_valid[:, :, :-1] &= (matched & valid)[..., None]
     return VectorMemory(
         queries=shifted(memory.queries, queries),
         poses=shifted(memory.poses, ego_to_global[:, None].expand(-1, rows, -1, -1)),

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs
+from predmapnet.network.interface import FrameInputs, RigGeometry
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.view_transform import RigLookup
 from predmapnet.training.batches import Batch, SingleFrameBatches, TrainingScenes
 from predmapnet.training.losses import frame_losses
 from predmapnet.training.settings import TrainingSettings
@@ -39,7 +38,7 @@ class SingleFrameStage:
     def __init__(
         self,
         network: PredMapNet,
-        lookup: RigLookup,
+        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
         workers: Workers,

@@ -99,8 +99,7 @@ class FeatureStore:
 
     def pack(self, features: BevFeatures) -> NDArray[np.float16]:
         """Flatten the features of ``B`` frames to ``(B, values)``."""
-        levels = (features.fine, features.middle, features.coarse)
-        packed: NDArray[np.float16] = torch.cat([level.flatten(1) for level in levels], 1).half().numpy()
+        packed: NDArray[np.float16] = torch.cat([level.flatten(1) for level in features.levels], 1).half().numpy()
         return packed
 
     def read(self, scenes: NDArray[np.int64], frames: NDArray[np.int64]) -> BevFeatures:
@@ -108,7 +107,7 @@ class FeatureStore:
         rows = np.stack([self._scene(int(scene))[frame] for scene, frame in zip(scenes, frames, strict=True)])
         parts = torch.from_numpy(rows).split(self._sizes, 1)
         levels = [part.float().reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True)]
-        return BevFeatures(*(level.contiguous(memory_format=torch.channels_last) for level in levels))
+        return BevFeatures([level.contiguous(memory_format=torch.channels_last) for level in levels])
 
     def _scene(self, scene: int) -> NDArray[np.float16]:
         if scene not in self._open:

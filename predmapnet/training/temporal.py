@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from predmapnet.config import LookupBevConfig
+from predmapnet.errors import UserError
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, StreamState
+from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import instances_from_rows
-from predmapnet.network.view_transform import RigLookup
 from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.losses import forecast_loss, frame_losses
 from predmapnet.training.ownership import Chosen, Owners, choose_tracks, owned_truth
@@ -42,7 +43,7 @@ class TemporalStage:
     def __init__(
         self,
         network: PredMapNet,
-        lookup: RigLookup,
+        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
         folder: Path,
@@ -70,6 +71,8 @@ class TemporalStage:
             if module is not None:
                 module.requires_grad_(False)
         config = self._network.config
+        if not isinstance(config.bev, LookupBevConfig):
+            raise UserError(f"{config.name} has the past in its BEV features, so that they cannot be computed once.")
         # Halved sizes are rounded up.
         sizes = [(-(-config.bev.rows // scale), -(-config.bev.columns // scale)) for scale in (1, 2, 4)]
         shapes = tuple((width, *size) for width, size in zip(config.bev.widths, sizes, strict=True))
@@ -95,7 +98,7 @@ class TemporalStage:
         terms: dict[str, Tensor] = {}
         following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
         for instant, features, coming in zip(batch.instants, batch.features, following, strict=True):
-            inputs = FrameInputs(features.fine.new_zeros(0), instant.camera_valid, instant.ego_to_global)
+            inputs = FrameInputs(features.levels[0].new_zeros(0), instant.camera_valid, instant.ego_to_global)
             outputs = self._network.decode_bev(features, inputs, state)
             rows = state.instances.valid.shape[1]
             points = outputs.layers[-1].points
@@ -126,9 +129,7 @@ class TemporalStage:
         """Return plan, state and owners of the streams."""
         tensors = {f"plan.{name}": value for name, value in self._plan.tensors().items()}
         tensors |= {f"owners.{name}": value for name, value in vars(self._owners).items()}
-        for name, value in self._state.tensors().items():
-            tensors[name if name.startswith("instances.") else f"state.{name}"] = value
-        return tensors
+        return tensors | {f"state.{name}": value for name, value in self._state.tensors().items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
         """Continue from what :meth:`state` returned."""
@@ -138,8 +139,7 @@ class TemporalStage:
 
         self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
         self._owners = Owners(**part("owners."))
-        instances = {f"instances.{name}": value for name, value in part("instances.").items()}
-        self._state = StreamState.from_tensors(part("state.") | instances)
+        self._state = StreamState.from_tensors(part("state."))
         if self._clips is not None:
             self._clips.plan = self._plan
 
@@ -167,7 +167,8 @@ class TemporalStage:
                     normalised = normalise_images(images, self._network.config.image)
                     valid = torch.ones(images.shape[:2], dtype=torch.bool)
                     inputs = FrameInputs(normalised, valid, torch.zeros(stop - start, 4, 4, dtype=torch.float64))
-                    values[start:stop] = store.pack(self._network.encode_bev(inputs, self._lookup))
+                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs, self._lookup)
+                    values[start:stop] = store.pack(features)
             if self._workers.leads and done % 10 == 9:
                 self._report(f"BEV features: {done + 1}/{len(mine)} scenes of this process")
 
@@ -201,6 +202,7 @@ def forget(state: StreamState, streams: Tensor) -> StreamState:
         instances=instances,
         point_history_valid=state.point_history_valid & keep[:, :, None],
         next_track_id=state.next_track_id.masked_fill(streams, 0),
+        frame=state.frame.masked_fill(streams, 0),
         bev_memory_valid=state.bev_memory_valid & keep,
         lost=None if state.lost is None else replace(state.lost, valid=state.lost.valid & keep),
     )

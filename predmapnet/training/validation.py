@@ -14,10 +14,9 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, threshol
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs
+from predmapnet.network.interface import FrameInputs, RigGeometry
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import select
-from predmapnet.network.view_transform import RigLookup
 from predmapnet.training.frames import CachedScene
 
 Float = NDArray[np.float64]
@@ -31,7 +30,7 @@ FRAME_INTERVAL_NS = 500_000_000
 
 @torch.no_grad()
 def validate(
-    network: PredMapNet, lookup: RigLookup, scenes: Sequence[CachedScene], streaming: bool
+    network: PredMapNet, lookup: RigGeometry, scenes: Sequence[CachedScene], streaming: bool
 ) -> dict[str, float]:
     """Measure a network on cached scenes.
 
@@ -66,7 +65,7 @@ def validate(
 
 @torch.no_grad()
 def map_frames(
-    network: PredMapNet, lookup: RigLookup, scene: CachedScene, indices: Iterable[int], streaming: bool
+    network: PredMapNet, lookup: RigGeometry, scene: CachedScene, indices: Iterable[int], streaming: bool
 ) -> Iterator[FrameMap]:
     """Yield the maps of some frames of a cached scene.
 

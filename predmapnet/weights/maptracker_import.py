@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
-from pydantic import ValidationError
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
-from predmapnet import __version__
+from predmapnet.config import BevFormerConfig, PredMapNetConfig, preset
 from predmapnet.errors import UserError
-from predmapnet.files import write_whole
-from predmapnet.network.maptracker import MapTracker
-from predmapnet.network.maptracker_config import MapTrackerConfig
-from predmapnet.weights.checkpoint import KEY
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.weights.maptracker_names import name_here, original_of_alias
 
-FORMAT = "maptracker-1"
 BEGINNINGS = (b"PK", b"\x80\x02", b"\x80\x04", b"\x80\x05")
 """Of files that torch or pickle have written."""
 
@@ -72,7 +63,7 @@ def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
     return {str(name).removeprefix("module."): value for name, value in state.items()}
 
 
-def import_maptracker(official: Mapping[str, Tensor]) -> tuple[MapTracker, ImportReport]:
+def import_maptracker(official: Mapping[str, Tensor]) -> tuple[PredMapNet, ImportReport]:
     """Make a network of an official state dict.
 
     Args:
@@ -101,7 +92,7 @@ def import_maptracker(official: Mapping[str, Tensor]) -> tuple[MapTracker, Impor
             unknown.append(name)
     if unknown:
         faults.append(f"{len(unknown)} unknown: {_some(unknown)}")
-    network = MapTracker(_configuration(found)).eval()
+    network = PredMapNet(_configuration(found)).eval()
     faults += _differing_constants(official, network.config)
     faults += _unfit(found, network, report)
     if faults:
@@ -110,61 +101,18 @@ def import_maptracker(official: Mapping[str, Tensor]) -> tuple[MapTracker, Impor
     return network, report
 
 
-def save_maptracker(path: Path, network: MapTracker, facts: Mapping[str, Any] | None = None) -> None:
-    """Write a network as safetensors; the file appears whole or not at all.
-
-    Args:
-        path: ends in ``.safetensors``.
-        network: whose weights and configuration are written.
-        facts: where it comes from, JSON types only.
-    """
-    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
-    about = {
-        "format": FORMAT,
-        "version": __version__,
-        "configuration": network.config.model_dump(mode="json"),
-        "facts": dict(facts or {}),
-    }
-    with write_whole(path) as temporary:
-        temporary.write_bytes(save(tensors, {KEY: json.dumps(about)}))
-
-
-def load_maptracker(path: Path) -> MapTracker:
-    """Read a network that :func:`save_maptracker` wrote, in evaluation mode.
-
-    Raises:
-        UserError: the file is missing, damaged, from something else, or its weights do not fit.
-    """
-    if not path.is_file():
-        raise UserError(f"There is no weights file {path}.")
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get(KEY, "{}"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is not a whole safetensors file ({error}). Write it again.") from None
-    if about.get("format") != FORMAT:
-        raise UserError(f"{path} does not hold MapTracker weights (its format is {about.get('format')}).")
-    try:
-        network = MapTracker(MapTrackerConfig.model_validate(about["configuration"])).eval()
-    except ValidationError as error:
-        raise UserError(f"The configuration in {path} does not fit: {error}") from None
-    faults = _unfit(tensors, network, ImportReport())
-    if faults:
-        raise UserError(f"The weights in {path} do not fit their configuration: {'; '.join(faults)}.")
-    network.load_state_dict(tensors)
-    return network
-
-
-def _configuration(found: Mapping[str, Tensor]) -> MapTrackerConfig:
-    """Return the configuration that the number of cameras tells."""
+def _configuration(found: Mapping[str, Tensor]) -> PredMapNetConfig:
+    """Return the preset that the number of cameras tells."""
     code = found.get(CAMERA_CODE)
-    if code is None or len(code) == MapTrackerConfig().cameras:
-        return MapTrackerConfig()
-    return MapTrackerConfig(name="maptracker-av2", cameras=len(code), image_height=608, image_width=608)
+    by_cameras = {
+        config.bev.cameras: config
+        for config in map(preset, ("maptracker-nuscenes", "maptracker-av2"))
+        if isinstance(config.bev, BevFormerConfig)
+    }
+    return preset("maptracker-nuscenes") if code is None else by_cameras.get(len(code), preset("maptracker-nuscenes"))
 
 
-def _unfit(found: Mapping[str, Tensor], network: MapTracker, report: ImportReport) -> list[str]:
+def _unfit(found: Mapping[str, Tensor], network: PredMapNet, report: ImportReport) -> list[str]:
     """Compare names and shapes with the network's; counters of batches are the only ones that may be missing."""
     wanted = network.state_dict()
     absent = [name for name in wanted if name not in found]
@@ -180,10 +128,10 @@ def _unfit(found: Mapping[str, Tensor], network: MapTracker, report: ImportRepor
     return [f"{len(names)} {what}: {_some(names)}" for what, names in named.items() if names]
 
 
-def _differing_constants(official: Mapping[str, Tensor], config: MapTrackerConfig) -> list[str]:
+def _differing_constants(official: Mapping[str, Tensor], config: PredMapNetConfig) -> list[str]:
     """Compare the region of interest and the warp grid that the file holds with the configuration."""
-    x = torch.linspace(-config.roi_length / 2, config.roi_length / 2, config.columns, dtype=torch.float64)
-    y = torch.linspace(config.roi_width / 2, -config.roi_width / 2, config.rows, dtype=torch.float64)
+    x = torch.linspace(-config.roi_length / 2, config.roi_length / 2, config.bev.columns, dtype=torch.float64)
+    y = torch.linspace(config.roi_width / 2, -config.roi_width / 2, config.bev.rows, dtype=torch.float64)
     x, y = torch.broadcast_tensors(x[None, :], y[:, None])
     size = torch.tensor([config.roi_length, config.roi_width])
     constants = {

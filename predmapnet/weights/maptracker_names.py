@@ -6,25 +6,25 @@ import re
 
 _RESNET, _NECK, _BEV = "backbone.img_backbone.", "backbone.img_neck.", "backbone.transformer."
 _ENCODER, _DECODER = f"{_BEV}encoder.layers.*.", "head.transformer.decoder.layers.*."
-_ENCODER_HERE, _DECODER_HERE = "bev_encoder.layers.*.", "decoder.layers.*."
+_ENCODER_HERE, _DECODER_HERE = "bev_encoder.layers.*.", "map_decoder.layers.*."
 
 RULES = {
-    f"{_RESNET}conv1.": "image_backbone.stem.convolution.",
-    f"{_RESNET}bn1.": "image_backbone.stem.norm.",
-    f"{_RESNET}layer*.*.conv1.": "image_backbone.stages.*.*.reduce.convolution.",
-    f"{_RESNET}layer*.*.bn1.": "image_backbone.stages.*.*.reduce.norm.",
-    f"{_RESNET}layer*.*.conv2.conv_offset.": "image_backbone.stages.*.*.spatial.convolution.offsets.",
-    f"{_RESNET}layer*.*.conv2_offset.": "image_backbone.stages.*.*.spatial.convolution.offsets.",
-    f"{_RESNET}layer*.*.conv2.": "image_backbone.stages.*.*.spatial.convolution.",
-    f"{_RESNET}layer*.*.bn2.": "image_backbone.stages.*.*.spatial.norm.",
-    f"{_RESNET}layer*.*.conv3.": "image_backbone.stages.*.*.expand.convolution.",
-    f"{_RESNET}layer*.*.bn3.": "image_backbone.stages.*.*.expand.norm.",
-    f"{_RESNET}layer*.*.downsample.0.": "image_backbone.stages.*.*.shortcut.convolution.",
-    f"{_RESNET}layer*.*.downsample.1.": "image_backbone.stages.*.*.shortcut.norm.",
-    f"{_NECK}lateral_convs.*.conv.": "neck.lateral.*.convolution.",
-    f"{_NECK}lateral_convs.*.bn.": "neck.lateral.*.norm.",
-    f"{_NECK}fpn_convs.*.conv.": "neck.smooth.*.convolution.",
-    f"{_NECK}fpn_convs.*.bn.": "neck.smooth.*.norm.",
+    f"{_RESNET}conv1.": "image_backbone.resnet.stem.convolution.",
+    f"{_RESNET}bn1.": "image_backbone.resnet.stem.norm.",
+    f"{_RESNET}layer*.*.conv1.": "image_backbone.resnet.stages.*.*.reduce.convolution.",
+    f"{_RESNET}layer*.*.bn1.": "image_backbone.resnet.stages.*.*.reduce.norm.",
+    f"{_RESNET}layer*.*.conv2.conv_offset.": "image_backbone.resnet.stages.*.*.spatial.convolution.offsets.",
+    f"{_RESNET}layer*.*.conv2_offset.": "image_backbone.resnet.stages.*.*.spatial.convolution.offsets.",
+    f"{_RESNET}layer*.*.conv2.": "image_backbone.resnet.stages.*.*.spatial.convolution.",
+    f"{_RESNET}layer*.*.bn2.": "image_backbone.resnet.stages.*.*.spatial.norm.",
+    f"{_RESNET}layer*.*.conv3.": "image_backbone.resnet.stages.*.*.expand.convolution.",
+    f"{_RESNET}layer*.*.bn3.": "image_backbone.resnet.stages.*.*.expand.norm.",
+    f"{_RESNET}layer*.*.downsample.0.": "image_backbone.resnet.stages.*.*.shortcut.convolution.",
+    f"{_RESNET}layer*.*.downsample.1.": "image_backbone.resnet.stages.*.*.shortcut.norm.",
+    f"{_NECK}lateral_convs.*.conv.": "image_backbone.pyramid.lateral.*.convolution.",
+    f"{_NECK}lateral_convs.*.bn.": "image_backbone.pyramid.lateral.*.norm.",
+    f"{_NECK}fpn_convs.*.conv.": "image_backbone.pyramid.smooth.*.convolution.",
+    f"{_NECK}fpn_convs.*.bn.": "image_backbone.pyramid.smooth.*.norm.",
     "backbone.bev_embedding.weight": "bev_encoder.queries",
     "backbone.positional_encoding.row_embed.weight": "bev_encoder.row_code",
     "backbone.positional_encoding.col_embed.weight": "bev_encoder.column_code",
@@ -51,15 +51,15 @@ RULES = {
     f"{_BEV}encoder.temporal_mem_layers.*.res_layer.0.bn1.": f"{_ENCODER_HERE}fusion.first.norm.",
     f"{_BEV}encoder.temporal_mem_layers.*.res_layer.0.conv2.": f"{_ENCODER_HERE}fusion.second.convolution.",
     f"{_BEV}encoder.temporal_mem_layers.*.res_layer.0.bn2.": f"{_ENCODER_HERE}fusion.second.norm.",
-    "seg_decoder.conv_in.": "raster_head.before.",
-    "seg_decoder.conv_mid_layers.0.1.": "raster_head.after.",
-    "seg_decoder.conv_out.": "raster_head.classify.",
-    "query_propagate.fc.*.": "motion.perceptron.*.",
-    "head.query_embedding.weight": "detection_queries",
-    "head.reference_points_embed.": "reference_points.",
-    "head.input_proj.": "decoder.input.",
-    "head.cls_branches.0.": "decoder.classify.",
-    "head.reg_branches.0.*.": "decoder.line.*.",
+    "seg_decoder.conv_in.": "segmentation_head.before.",
+    "seg_decoder.conv_mid_layers.0.1.": "segmentation_head.after.",
+    "seg_decoder.conv_out.": "segmentation_head.classify.",
+    "query_propagate.fc.*.": "propagation.motion.perceptron.*.",
+    "head.query_embedding.weight": "query_generator.content",
+    "head.reference_points_embed.": "query_generator.first_guess.0.",
+    "head.input_proj.": "map_decoder.input.",
+    "head.cls_branches.0.": "map_decoder.classify.",
+    "head.reg_branches.0.*.": "map_decoder.line.*.",
     f"{_DECODER}attentions.0.attn.": f"{_DECODER_HERE}self_attention.attention.",
     f"{_DECODER}attentions.1.sampling_offsets.": f"{_DECODER_HERE}bev_attention.sampling_offsets.",
     f"{_DECODER}attentions.1.attention_weights.": f"{_DECODER_HERE}bev_attention.attention_weights.",
@@ -84,14 +84,14 @@ def name_here(official: str) -> str | None:
 
     Example:
         >>> name_here("backbone.img_backbone.layer3.0.conv2.conv_offset.bias")
-        'image_backbone.stages.2.0.spatial.convolution.offsets.bias'
+        'image_backbone.resnet.stages.2.0.spatial.convolution.offsets.bias'
     """
     for pattern, here in _PATTERNS:
         found = pattern.match(official)
         if found is None:
             continue
         numbers = list(found.groups())
-        if here.startswith("image_backbone.stages."):
+        if here.startswith("image_backbone.resnet.stages."):
             numbers[0] = str(int(numbers[0]) - FIRST_STAGE)
         for number in numbers:
             here = here.replace("*", number, 1)

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from predmapnet.config import PredMapNetConfig
 from predmapnet.network.camera_pillars import CameraPillars, make_camera_pillars
 from predmapnet.network.interface import FrameInputs
-from predmapnet.network.maptracker import MapTracker
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.weights.maptracker_import import import_maptracker
 
 PROJECT = Path(__file__).resolve().parents[3]
@@ -62,7 +62,7 @@ class Reference:
         return state
 
     @cached_property
-    def network(self) -> MapTracker:
+    def network(self) -> PredMapNet:
         return import_maptracker(self.official_state)[0]
 
     def sizes(self) -> list[tuple[int, int]]:
@@ -86,8 +86,8 @@ class Reference:
             ego_to_global=pose(rotations[frame], translations[frame])[None],
         )
 
-    def pillars(self, size: tuple[int, int], config: MapTrackerConfig) -> CameraPillars:
-        return make_camera_pillars(torch.from_numpy(self.spec.ego2img(*size)), size, config)
+    def pillars(self, size: tuple[int, int], config: PredMapNetConfig) -> CameraPillars:
+        return make_camera_pillars(torch.from_numpy(self.spec.ego2img(*size)), size, config.bev, config.roi)
 
 
 @cache

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from predmapnet.network.maptracker_config import MapTrackerConfig
 from pydantic import ValidationError
 
 from mapfusion.geometry import inverse_pose
@@ -28,7 +29,6 @@ from predmapnet.network.image_input import (
     normalise_images,
     stack_windows,
 )
-from predmapnet.network.maptracker_config import MapTrackerConfig
 from predmapnet.network.view_transform import make_rig_lookup
 from tests.predmapnet.network.maptracker_reference import FOLDER
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.config import preset
 from predmapnet.network.motion_mlp import MotionMlp
 from predmapnet.network.vector_memory import empty_vector_memory, recall, remember
 from tests.predmapnet.network.maptracker_reference import FOLDER, difference, load_reference, pose
@@ -25,8 +25,8 @@ def expected():
 
 @pytest.fixture(scope="module")
 def motion():
-    spec, config = load_reference().spec, MapTrackerConfig()
-    perceptron = MotionMlp(config.decoder_width, 2 * config.decoder_width)
+    spec, width = load_reference().spec, preset("maptracker-nuscenes").decoder.width
+    perceptron = MotionMlp(width, 2 * width)
     state = {}
     for name, tensor in perceptron.state_dict().items():
         official = f"query_propagate.fc.{name.removeprefix('perceptron.')}"
@@ -38,7 +38,7 @@ def motion():
 @pytest.mark.reference
 @torch.no_grad()
 def test_entries_are_kept_chosen_and_carried_as_officially(expected, motion):
-    reference, config = load_reference(), MapTrackerConfig()
+    reference, config = load_reference(), preset("maptracker-nuscenes")
     steps = 1 + max(int(name[1:].split("/")[0]) for name in expected if re.match(r"t\d+/", name))
     translations, rotations = reference.spec.unit_poses(steps)
     memory, ids, born_ever = empty_vector_memory(1, config, torch.device("cpu")), [], 0
@@ -49,7 +49,7 @@ def test_entries_are_kept_chosen_and_carried_as_officially(expected, motion):
             name.removeprefix(f"t{step}/"): value for name, value in expected.items() if name.startswith(f"t{step}/")
         }
         if step > 0:
-            recalled = recall(memory, motion, now, frame, config)
+            recalled = recall(memory, motion, now, frame, config.decoder.memory_distances)
             entries = memory.valid[0].sum(dim=-1)
             first = memory.valid.shape[-1] - entries
             chosen = (recalled.slots[0] - first[:, None])[entries > recalled.slots.shape[-1]]
@@ -60,10 +60,11 @@ def test_entries_are_kept_chosen_and_carried_as_officially(expected, motion):
         kept, born = reference.spec.unit_keep(step, ids)
         queries = torch.from_numpy(reference.spec.unit_hs(step, len(ids) + 100))
         rows = [*kept, *(len(ids) + index for index in born)]
-        source = torch.tensor([[*kept, *(-1 for _ in born)]])
+        source = torch.tensor([[*kept, *(0 for _ in born)]])
+        matched = torch.tensor([[*(True for _ in kept), *(False for _ in born)]])
         ids = [ids[index] for index in kept] + list(range(born_ever, born_ever + len(born)))
         born_ever += len(born)
-        memory = remember(memory, queries[rows][None], source, now, frame, torch.ones(1, len(rows), dtype=torch.bool))
+        memory = remember(memory, queries[rows][None], source, matched, now, frame, torch.ones_like(matched))
         assert ids == values["active_ids_after"].tolist()
-        lengths = np.minimum(values["entry_lengths_after"], config.history_capacity)
+        lengths = np.minimum(values["entry_lengths_after"], config.decoder.memory_capacity)
         assert memory.valid[0].sum(dim=-1).tolist() == lengths.tolist(), step

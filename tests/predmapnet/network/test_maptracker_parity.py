@@ -10,9 +10,10 @@ from torch import Tensor
 
 from predmapnet.network.bev_history import BevHistory, look_back
 from predmapnet.network.camera_pillars import CameraPillars, project_pillars
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Selection
-from predmapnet.network.maptracker import MapTracker, MapTrackerState, select_tracks
-from predmapnet.network.raster_head import semantic_mask
+from predmapnet.network.interface import FrameInputs, FrameOutputs, Selection, StreamState
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.segmentation_head import semantic_mask
+from predmapnet.network.tracking import select
 from predmapnet.network.vector_memory import age_code, recall
 from tests.predmapnet.network.maptracker_reference import FOLDER, Reference, difference, load_reference, recorded
 
@@ -85,7 +86,7 @@ def run(request) -> Run:
             inputs, expected = reference.inputs(size, frame, frames), reference.expected(size, frame)
             with recorded(dict(network.named_modules())) as calls:
                 outputs = network(inputs, pillars, state)
-            selection = select_tracks(outputs, state, network.config)
+            selection = select(outputs, state, network.config)
             step = Step(reference, network, inputs, pillars, state, calls, outputs, selection)
             state = network.advance(state, outputs, selection.instances, inputs)
             found = step.fixtures(size, state)
@@ -107,10 +108,10 @@ class Step:
     """One frame, and all that can be said of it."""
 
     reference: Reference
-    network: MapTracker
+    network: PredMapNet
     inputs: FrameInputs
     pillars: CameraPillars
-    state: MapTrackerState
+    state: StreamState
     calls: dict[str, list[tuple[tuple[Tensor, ...], Tensor]]]
     outputs: FrameOutputs
     selection: Selection
@@ -118,36 +119,30 @@ class Step:
     def out(self, module: str) -> Tensor:
         return self.calls[module][-1][1]
 
-    def fixtures(self, size: tuple[int, int], after: MapTrackerState) -> dict[str, Tensor]:
+    def fixtures(self, size: tuple[int, int], after: StreamState) -> dict[str, Tensor]:
         """Everything under the name of its fixture."""
-        history = look_back(
-            self.state.bev_memory,
-            self.state.bev_memory_pose,
-            self.state.bev_memory_valid,
-            self.inputs.ego_to_global,
-            self.network.config,
-        )
+        history = look_back(self.state, self.inputs.ego_to_global, self.network.config)
         return (
             self.image_features()
             | self.projections(size)
             | self.encoder(history)
             | self.decoder()
-            | self.rows(history)
+            | self.rows()
             | self.memory(after)
             | self.results(after)
         )
 
     def image_features(self) -> dict[str, Tensor]:
-        first = "image_backbone.stages.2.0.spatial.convolution"
-        named = {"stem_maxpool": self.out("image_backbone.pool"), "layer3.0.dcn_out": self.out(first)}
+        first = "image_backbone.resnet.stages.2.0.spatial.convolution"
+        named = {"stem_maxpool": self.out("image_backbone.resnet.pool"), "layer3.0.dcn_out": self.out(first)}
         named["layer3.0.conv_offset"] = self.out(f"{first}.offsets")
-        named |= {f"res_layer{stage + 1}": self.out(f"image_backbone.stages.{stage}") for stage in range(4)}
-        named |= {f"backbone_level{level}": self.out(f"image_backbone.stages.{level + 1}") for level in range(3)}
-        return named | {f"fpn_level{level}": self.out(f"neck.smooth.{level}") for level in range(3)}
+        named |= {f"res_layer{stage + 1}": self.out(f"image_backbone.resnet.stages.{stage}") for stage in range(4)}
+        named |= {f"backbone_level{level}": self.out(f"image_backbone.resnet.stages.{level + 1}") for level in range(3)}
+        return named | {f"fpn_level{level}": self.out(f"image_backbone.pyramid.smooth.{level}") for level in range(3)}
 
     def projections(self, size: tuple[int, int]) -> dict[str, Tensor]:
         ego_to_image = torch.from_numpy(self.reference.spec.ego2img(*size))
-        positions, inside = project_pillars(ego_to_image, size, self.network.config)
+        positions, inside = project_pillars(ego_to_image, size, self.network.config.bev, self.network.config.roi)
         return {
             "sca_ref_cam": positions.where(inside[..., None], 0.0)[:, None],
             "sca_bev_mask": inside[:, None],
@@ -155,7 +150,7 @@ class Step:
         }
 
     def tokens(self) -> Tensor:
-        levels = [self.out(f"neck.smooth.{level}")[None] for level in range(3)]
+        levels = [self.out(f"image_backbone.pyramid.smooth.{level}")[None] for level in range(3)]
         return self.network.bev_encoder.image_tokens(levels)
 
     def encoder(self, history: BevHistory) -> dict[str, Tensor]:
@@ -194,12 +189,12 @@ class Step:
 
     def decoder(self) -> dict[str, Tensor]:
         named = {"hs_last_first8": self.outputs.queries[0, :8]}
-        cells = self.network.decoder.bev_cells(self.outputs.bev)
+        cells = self.network.map_decoder.bev_cells(self.outputs.bev)
         named["dec_bev_value"] = cells.transpose(1, 2).unflatten(2, self.outputs.bev.shape[2:])
         parts = {"self_attn": "self_attention", "bev_attn": "bev_attention", "ffn": "perceptron"}
         parts |= {f"norm{number}": f"norms.{number}" for number in range(4)}
         for number, layer in enumerate(self.outputs.layers):
-            path = f"decoder.layers.{number}"
+            path = f"map_decoder.layers.{number}"
             named |= {f"dec{number}.{name}": self.out(f"{path}.{part}").transpose(0, 1) for name, part in parts.items()}
             if self.calls[f"{path}.memory_attention"]:
                 named[f"dec{number}.mem_attn"] = self.out(f"{path}.memory_attention")
@@ -207,11 +202,11 @@ class Step:
             named |= {f"dec{number}.lines": layer.points[0].flatten(1), f"dec{number}.logits": layer.logits[0]}
         return named
 
-    def rows(self, history: BevHistory) -> dict[str, Tensor]:
-        rows = self.network.decoder_rows(self.state, history, self.inputs.ego_to_global)
+    def rows(self) -> dict[str, Tensor]:
+        (rows, _), _ = self.calls["map_decoder"][0]
         tracks = rows.memory.queries.shape[1]
-        logits, points = self.network.decoder.read_out(rows.queries[0, :tracks])
-        (memory_in, memory_out), ((queries, pose), carried) = self.calls["motion"][:2]
+        logits, points = self.network.map_decoder.read_out(rows.queries[0, :tracks])
+        (memory_in, memory_out), ((queries, pose), carried) = self.calls["propagation.motion"][:2]
         slots = min(int(self.state.frame), 4)
         return {
             "dec_query_in": rows.queries[0],
@@ -227,16 +222,18 @@ class Step:
             "propmlp_memory.out": slot_major(memory_out, slots),
         }
 
-    def memory(self, after: MapTrackerState) -> dict[str, Tensor]:
+    def memory(self, after: StreamState) -> dict[str, Tensor]:
         config, pose = self.network.config, self.inputs.ego_to_global
-        recalled = recall(self.state.vector_memory, self.network.motion, pose, self.state.frame, config)
+        distances = config.decoder.memory_distances
+        motion, frame = self.network.propagation.motion, self.state.frame
+        recalled = recall(self.state.vector_memory, motion, pose, frame, distances)
         entries = self.state.vector_memory.valid[0].sum(dim=-1)
         long = entries > recalled.slots.shape[-1]
         first = self.state.vector_memory.valid.shape[-1] - entries
         # Where there is no entry, the fixtures hold what the official code computes there before it masks it.
         empty = ~recalled.valid[0].T[..., None]
         computed = torch.arange(recalled.slots.shape[-1])[:, None] < self.state.frame
-        nothing = self.calls["motion"][0][1][0].transpose(0, 1) * computed[..., None]
+        nothing = self.calls["propagation.motion"][0][1][0].transpose(0, 1) * computed[..., None]
         oldest = age_code(self.state.frame * computed, recalled.code.shape[-1])
         return {
             "memory.embeds_propagated": torch.where(empty, nothing, recalled.queries[0].transpose(0, 1)),
@@ -247,13 +244,13 @@ class Step:
             "memory.valid_track_idx_after": torch.arange(after.instances.valid.shape[1]),
         }
 
-    def entry_lengths(self, expected: np.ndarray, after: MapTrackerState) -> float:
+    def entry_lengths(self, expected: np.ndarray, after: StreamState) -> float:
         """Compare the number of entries of each track; the fixture goes on counting what is forgotten."""
         memory = after.vector_memory.valid[0]
         counted = np.minimum(expected[after.instances.track_ids[0].numpy()], memory.shape[-1])
         return float(np.abs(memory.sum(dim=-1).numpy() - counted).max(initial=0))
 
-    def results(self, after: MapTrackerState) -> dict[str, Tensor]:
+    def results(self, after: StreamState) -> dict[str, Tensor]:
         last, kept = self.outputs.layers[-1], self.selection.instances
         assert last.logits is not None and last.points is not None
         tracks = self.state.instances.valid.shape[1]

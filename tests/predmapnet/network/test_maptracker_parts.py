@@ -9,81 +9,24 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from predmapnet.config import ALL_QUIRKS, MapTrackerQuirks
 from predmapnet.network.bev_history import warp_grid
-from predmapnet.network.camera_pillars import make_camera_pillars
 from predmapnet.network.deformable_attention import deformable_attention
 from predmapnet.network.deformable_convolution import DeformableConvolution
+from predmapnet.network.ego_motion import invert_pose, quaternion
 from predmapnet.network.history_choice import choose_history
-from predmapnet.network.interface import FrameInputs
-from predmapnet.network.maptracker import MapTracker, MapTrackerState, move_on_ground, select_tracks
-from predmapnet.network.maptracker_config import MapTrackerConfig, MapTrackerQuirks
 from predmapnet.network.normalised_convolution import NormalisedConvolution
-from predmapnet.network.rigid_motion import invert_pose, quaternion
-
-SMALL = MapTrackerConfig(
-    rows=10,
-    columns=20,
-    bev_width=32,
-    bev_heads=4,
-    bev_hidden=32,
-    decoder_width=32,
-    decoder_heads=4,
-    decoder_layers=2,
-    decoder_hidden=32,
-    queries=12,
-    points=5,
-    cameras=2,
-    history_capacity=6,
-    # An untrained network scores everything about 0.5.
-    keep_threshold=0.4,
-    birth_threshold=0.52,
+from tests.predmapnet.network.small_baseline import (
+    frames,
+    small_config,
+    small_network,
+    step,
+    together,
 )
-SIZE = (64, 96)
-NO_QUIRKS = MapTrackerQuirks(**dict.fromkeys(MapTrackerQuirks.model_fields, False))
 
-
-def two_cameras() -> Tensor:
-    """One camera looks forward, one back, 1.5 m above the ground."""
-    intrinsics = np.array([[60.0, 0, 48, 0], [0, 60.0, 32, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    forward = np.array([[0.0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]])
-    backward = np.array([[0.0, 1, 0, 0], [0, 0, -1, 1.5], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    return torch.from_numpy(np.stack([intrinsics @ forward, intrinsics @ backward]))
-
-
-def small_network(seed: int = 0, **changes: object) -> MapTracker:
-    torch.manual_seed(seed)
-    network = MapTracker(SMALL.model_copy(update=changes)).eval()
-    with torch.no_grad():
-        # Sampling offsets and biases away from zero, so that nothing is trivial.
-        for name, parameter in network.named_parameters():
-            if parameter.ndim == 1:
-                parameter.add_(0.1 * torch.randn_like(parameter))
-            elif name.endswith("offsets.weight"):
-                parameter.add_(0.05 * torch.randn_like(parameter))
-    return network
-
-
-def frames(count: int, seed: int, step: float = 1.7) -> list[FrameInputs]:
-    generator = torch.Generator().manual_seed(seed)
-    inputs = []
-    for number in range(count):
-        pose = torch.eye(4, dtype=torch.float64)[None]
-        pose[0, :2, 3] = torch.tensor([1000.0 + step * number, -500.0 + seed], dtype=torch.float64)
-        images = 30 * torch.randn(1, 2, 3, *SIZE, generator=generator)
-        inputs.append(FrameInputs(images, torch.ones(1, 2, dtype=torch.bool), pose))
-    return inputs
-
-
-def together(streams: list[FrameInputs]) -> FrameInputs:
-    return FrameInputs(*(torch.cat([getattr(one, name) for one in streams]) for name in vars(streams[0])))
-
-
-@torch.no_grad()
-def step(network: MapTracker, inputs: FrameInputs, state: MapTrackerState | None):
-    pillars = make_camera_pillars(two_cameras(), SIZE, network.config)
-    outputs = network(inputs, pillars, state)
-    selection = select_tracks(outputs, state, network.config)
-    return outputs, network.advance(state, outputs, selection.instances, inputs)
+SMALL = small_config()
+QUERIES = SMALL.decoder.queries
+NO_QUIRKS = MapTrackerQuirks()
 
 
 def plain_deformable_convolution(convolution: DeformableConvolution, features: Tensor) -> Tensor:
@@ -194,33 +137,35 @@ def test_history_is_chosen_as_the_plain_rule_says(travelled, unused, fallback):
 
 def test_without_the_quirk_the_warp_by_no_motion_changes_nothing():
     still = torch.eye(4, dtype=torch.float64)[None]
-    maps = torch.rand(1, 3, SMALL.rows, SMALL.columns)
+    maps = torch.rand(1, 3, SMALL.bev.rows, SMALL.bev.columns)
     plain = F.grid_sample(maps, warp_grid(still, SMALL.model_copy(update={"quirks": NO_QUIRKS})), align_corners=False)
     torch.testing.assert_close(plain, maps, atol=1e-5, rtol=0)
     zoomed = F.grid_sample(maps, warp_grid(still, SMALL), align_corners=False)
     assert (zoomed - maps).abs().max() > 0.1
 
 
-def test_points_move_against_the_car():
+@torch.no_grad()
+def test_a_track_moves_against_the_car_and_stays_on_the_border():
     """The car drives 6 m forward: a point 6 m ahead is now here; what leaves the region stays on its border."""
-    past_to_current = torch.eye(4, dtype=torch.float64)[None]
-    past_to_current[0, 0, 3] = -6.0
-    points = torch.tensor([[[[0.6, 0.5], [0.05, 0.25]]]])
-    torch.testing.assert_close(
-        move_on_ground(points, past_to_current, SMALL), torch.tensor([[[[0.5, 0.5], [0.0, 0.25]]]])
-    )
+    network = small_network(small_config(quirks={"tracks_moved_from_chosen_history": False}))
+    first, second = frames(2, 0, step=6.0)
+    _, state = step(network, first, None)
+    state.instances.points[0, 0, :2] = torch.tensor([[0.6, 0.5], [0.05, 0.25]])
+    carried = network.propagation(state, second.ego_to_global)
+    torch.testing.assert_close(carried.points[0, 0, :2], torch.tensor([[0.5, 0.5], [0.0, 0.25]]))
 
 
-@pytest.mark.parametrize("quirks", [MapTrackerQuirks(), NO_QUIRKS], ids=["quirks", "no quirks"])
+@pytest.mark.parametrize("quirks", [ALL_QUIRKS, NO_QUIRKS], ids=["quirks", "no quirks"])
+@torch.no_grad()
 def test_streams_side_by_side_give_what_each_gives_alone(quirks):
-    network = small_network(quirks=quirks)
+    network = small_network(SMALL.model_copy(update={"quirks": quirks}))
     streams = [frames(7, seed) for seed in (0, 1)]
     alone = []
     for stream in streams:
         state, results = None, []
         for inputs in stream:
             outputs, state = step(network, inputs, state)
-            results.append((outputs.layers[-1].points[0, -SMALL.queries :], state.instances.track_ids[0].tolist()))
+            results.append((outputs.layers[-1].points[0, -QUERIES:], state.instances.track_ids[0].tolist()))
         alone.append(results)
     assert any(len(ids) for results in alone for _, ids in results[1:])
     state = None
@@ -228,12 +173,13 @@ def test_streams_side_by_side_give_what_each_gives_alone(quirks):
         outputs, state = step(network, together([stream[number] for stream in streams]), state)
         for stream in range(2):
             points, ids = alone[stream][number]
-            torch.testing.assert_close(outputs.layers[-1].points[stream, -SMALL.queries :], points, atol=2e-4, rtol=0)
+            torch.testing.assert_close(outputs.layers[-1].points[stream, -QUERIES:], points, atol=2e-4, rtol=0)
             assert state.instances.track_ids[stream][state.instances.valid[stream]].tolist() == ids
 
 
+@torch.no_grad()
 def test_a_step_leaves_the_state_that_went_in_as_it_was():
-    network, inputs = small_network(), frames(3, 0)
+    network, inputs = small_network(SMALL), frames(3, 0)
     _, state = step(network, inputs[0], None)
     _, state = step(network, inputs[1], state)
     first, _ = step(network, inputs[2], state)
@@ -241,39 +187,13 @@ def test_a_step_leaves_the_state_that_went_in_as_it_was():
     torch.testing.assert_close(first.queries, again.queries, atol=0, rtol=0)
 
 
-def test_a_masked_camera_reaches_nothing():
-    network = small_network()
-    inputs = frames(1, 0)[0]
-    inputs.camera_valid[0, 1] = False
-    outputs, _ = step(network, inputs, None)
-    inputs.images[0, 1] = torch.nan
-    again, _ = step(network, inputs, None)
-    torch.testing.assert_close(outputs.bev, again.bev, atol=0, rtol=0)
-
-
+@torch.no_grad()
 def test_memory_keeps_no_more_than_its_capacity():
-    network, state = small_network(), None
+    network, state = small_network(SMALL), None
     for inputs in frames(9, 0):
         _, state = step(network, inputs, state)
-    assert state.bev_memory.shape[1] == SMALL.history_capacity
-    assert state.vector_memory.valid.shape[2] == SMALL.history_capacity
+    assert state.bev_memory.shape[1] == SMALL.temporal_bev.capacity
+    assert state.vector_memory.valid.shape[2] == SMALL.decoder.memory_capacity
     ages = (state.frame[:, None, None] - state.vector_memory.frames)[state.vector_memory.valid]
-    assert ages.max() <= SMALL.history_capacity
+    assert ages.max() <= SMALL.decoder.memory_capacity
     assert (state.vector_memory.valid.sum(dim=-1) >= 1).all()
-
-
-def test_gradient_reaches_every_parameter():
-    """The motion perceptron learns from a loss of its own; without it, it is the only part without gradient."""
-    network = small_network().train()
-    pillars = make_camera_pillars(two_cameras(), SIZE, network.config)
-    state, loss = None, torch.zeros(())
-    for inputs in frames(2, 0):
-        outputs = network(inputs, pillars, state)
-        selection = select_tracks(outputs, state, network.config.model_copy(update={"first_birth_threshold": 0.0}))
-        state = network.advance(state, outputs, selection.instances, inputs)
-        loss = loss + outputs.segmentation.square().mean()
-        loss = loss + sum(layer.logits.square().mean() + layer.points.square().mean() for layer in outputs.layers)
-    loss.backward()
-    untouched = [name for name, value in network.named_parameters() if value.grad is None or not value.grad.any()]
-    assert all(name.startswith("motion.") for name in untouched), untouched
-    assert network.bev_encoder.level_code.grad[3].abs().max() == 0

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from predmapnet.config import preset
 from predmapnet.errors import UserError
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 from predmapnet.weights.inspection import inspect_file
 from predmapnet.weights.maptracker_import import (
     import_maptracker,
-    load_maptracker,
     read_official_checkpoint,
-    save_maptracker,
 )
 from predmapnet.weights.maptracker_names import RULES, name_here
 from tests.predmapnet.network.maptracker_reference import FOLDER, load_reference
@@ -48,8 +48,8 @@ def test_a_checkpoint_of_mmcv_comes_back_from_safetensors(official, tmp_path):
     path, out = tmp_path / "maptracker.pth", tmp_path / "weights.safetensors"
     torch.save({"meta": {"epoch": 48, "iter": 1}, "state_dict": official, "optimizer": {"state": {}}}, path)
     network, _ = import_maptracker(read_official_checkpoint(path))
-    save_maptracker(out, network, {"imported_from": path.name})
-    again = load_maptracker(out)
+    save_checkpoint(out, network, {"imported_from": path.name})
+    again = load_checkpoint(out).network
     assert again.config == network.config
     for name, tensor in network.state_dict().items():
         assert torch.equal(again.state_dict()[name], tensor)
@@ -74,15 +74,19 @@ def test_old_names_and_parallel_training_and_absent_counters(changed):
 def test_seven_cameras_are_argoverse(changed):
     changed["backbone.transformer.cams_embeds"] = torch.zeros(7, 256)
     network, _ = import_maptracker(changed)
-    assert (network.config.cameras, network.config.image_height, network.config.image_width) == (7, 608, 608)
+    assert network.config == preset("maptracker-av2") and network.config.bev.cameras == 7
 
 
 @pytest.mark.reference
 @pytest.mark.parametrize(
     ("name", "value", "says"),
     [
-        ("head.query_embedding.weight", None, "1 missing: detection_queries"),
-        ("head.query_embedding.weight", torch.zeros(50, 512), r"detection_queries \(50, 512\) instead of \(100, 512\)"),
+        ("head.query_embedding.weight", None, "1 missing: query_generator.content"),
+        (
+            "head.query_embedding.weight",
+            torch.zeros(50, 512),
+            r"query_generator.content \(50, 512\) instead of \(100, 512\)",
+        ),
         ("head.something_new", torch.zeros(3), "1 unknown: head.something_new"),
         ("head.cls_branches.3.bias", torch.zeros(3), "head.cls_branches.3.bias differs from head.cls_branches.0.bias"),
         ("head.roi_size", torch.tensor([100.0, 50.0]), "head.roi_size is not what a region of 60 m x 30 m needs"),
@@ -138,5 +142,5 @@ def test_a_file_without_a_state_dict_says_so(tmp_path):
 
 def test_names_are_translated_by_one_rule_only():
     assert len(set(RULES.values())) == len(RULES) - 1, "only the old name of the offsets shares a target"
-    assert name_here("head.transformer.decoder.layers.5.norms.2.bias") == "decoder.layers.5.norms.2.bias"
+    assert name_here("head.transformer.decoder.layers.5.norms.2.bias") == "map_decoder.layers.5.norms.2.bias"
     assert name_here("head.transformer.decoder.other") is None

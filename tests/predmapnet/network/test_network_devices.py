@@ -1,4 +1,4 @@
-"""No tensor of the baseline is made on the wrong device: the forward passes of a clip on a GPU, traced without one."""
+"""No tensor of the paper's network is made on the wrong device: a clip on a GPU, traced without one."""
 
 import warnings
 from dataclasses import replace
@@ -7,14 +7,11 @@ import pytest
 import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from predmapnet.network.camera_pillars import make_camera_pillars
-from predmapnet.network.interface import FrameInputs, Instances
-from predmapnet.network.maptracker import MapTracker
-from predmapnet.network.maptracker_config import MapTrackerConfig
+from predmapnet.network.interface import FrameInputs
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.tracking import instances_from_rows
+from tests.predmapnet.network.small_baseline import SIZE, small_config, small_pillars
 
-SMALL = MapTrackerConfig(
-    rows=10, columns=20, bev_width=32, bev_heads=4, decoder_width=32, decoder_heads=4, queries=12, points=5, cameras=2
-)
 TRACKS = 3
 GPU = torch.device("privateuseone:0")
 
@@ -33,28 +30,20 @@ def on_gpu(value, mode):
     return mode.from_tensor(value).detach().to(GPU)
 
 
-def tracks_of(outputs, batch) -> Instances:
+def tracks_of(outputs, batch):
     """The first detections become tracks, as a trainer would choose them."""
-    last = outputs.layers[-1]
-    integers = torch.arange(TRACKS, device=GPU).expand(batch, -1)
-    return Instances(
-        valid=integers >= 0,
-        track_ids=integers,
-        labels=integers,
-        scores=last.logits[:, -TRACKS:].amax(dim=-1).sigmoid(),
-        misses=integers,
-        queries=outputs.queries[:, -TRACKS:],
-        points=last.points[:, -TRACKS:],
-        masks=torch.zeros(batch, TRACKS, 0, 0, device=GPU),
-    )
+    rows = torch.arange(TRACKS, device=GPU).expand(batch, -1)
+    first = outputs.row_valid.shape[1] - small_config().decoder.queries
+    return instances_from_rows(outputs, first + rows, rows >= 0, rows)
 
 
-def test_the_frames_of_a_training_clip_stay_on_the_gpu():
-    batch, cameras = 2, SMALL.cameras
-    ego_to_image = torch.eye(4, dtype=torch.float64).expand(cameras, 4, 4)[:, [1, 2, 0, 3]] * 30
-    pillars = make_camera_pillars(ego_to_image, (64, 96), SMALL)
+@pytest.mark.parametrize("preset", ["maptracker-nuscenes", "paper-nuscenes"])
+def test_the_frames_of_a_training_clip_stay_on_the_gpu(preset):
+    config = small_config(preset)
+    batch, cameras = 2, config.bev.cameras
+    pillars = small_pillars(config)
     assert len(pillars.camera)
-    network = MapTracker(SMALL).train()
+    network = PredMapNet(config).train()
     with FakeTensorMode(allow_non_fake_inputs=False) as mode, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for module in network.modules():
@@ -67,14 +56,13 @@ def test_the_frames_of_a_training_clip_stay_on_the_gpu():
         state, loss = None, torch.zeros((), device=GPU)
         for _ in range(6):
             inputs = FrameInputs(
-                images=torch.zeros(batch, cameras, 3, 64, 96, device=GPU),
+                images=torch.zeros(batch, cameras, 3, *SIZE, device=GPU),
                 camera_valid=torch.ones(batch, cameras, dtype=torch.bool, device=GPU),
                 ego_to_global=torch.eye(4, dtype=torch.float64, device=GPU).expand(batch, 4, 4),
             )
             outputs = network(inputs, pillars, state)
             state = network.advance(state, outputs, tracks_of(outputs, batch), inputs)
-            loss = loss + outputs.segmentation.sum() + sum(layer.points.sum() for layer in outputs.layers)
+            loss = loss + outputs.segmentation.sum() + sum(layer.points.sum() for layer in outputs.layers[-2:])
         assert loss.device == GPU
-        values = [*vars(state).values(), *vars(state.instances).values(), *vars(state.vector_memory).values()]
-        assert all(value.device == GPU for value in values if isinstance(value, torch.Tensor))
+        assert all(value.device == GPU for value in state.tensors().values())
         assert state.bev_memory.shape[1] == 6
