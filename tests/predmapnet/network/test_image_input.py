@@ -10,11 +10,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from predmapnet.network.maptracker_config import MapTrackerConfig
 from pydantic import ValidationError
 
 from mapfusion.geometry import inverse_pose
-from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageConfig
+from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageConfig, preset
 from predmapnet.datasets.argoverse2 import GROUND_HEIGHT, Argoverse2Source
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes import NuScenesSource
@@ -146,9 +145,9 @@ def test_projections_of_the_real_car_are_the_official_ones():
     ours = ego_to_image(frame.rig, WHOLE)
     np.testing.assert_allclose(ours, official, atol=1e-9)
 
-    config = MapTrackerConfig()
-    positions, hits = project_pillars(torch.from_numpy(ours), input_size(WHOLE), config)
-    expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), config)
+    config = preset("maptracker-nuscenes")
+    positions, hits = project_pillars(torch.from_numpy(ours), input_size(WHOLE), config.bev, config.roi)
+    expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), config.bev, config.roi)
     assert torch.equal(hits, expected_hits)
     torch.testing.assert_close(positions[hits], expected[hits], rtol=0, atol=1e-6)
 
