@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mapfusion.config import IntegratorConfig
 from mapfusion.lines import FusedLine
-from mapfusion.matching import Correspondence, correspond, tangents
+from mapfusion.matching import Correspondence, correspond, tangents_of_all
 from mapfusion.observations import Observation
 
 Float = NDArray[np.float64]
@@ -53,25 +53,22 @@ def gather(lines: Mapping[int, FusedLine], low: Float, high: Float) -> LocalStat
     Returns:
         The stations, or None where there are none.
     """
-    elements: list[int] = []
-    owner, row, points, directions = [], [], [], []
-    for element, line in lines.items():
-        at = line.curve.points
-        inside = np.flatnonzero((at[:, 0] > low[0]) & (at[:, 0] < high[0]) & (at[:, 1] > low[1]) & (at[:, 1] < high[1]))
-        if len(inside):
-            owner.append(np.full(len(inside), len(elements)))
-            elements.append(element)
-            row.append(inside)
-            points.append(at[inside] - low)
-            directions.append(tangents(at)[inside])
-    if not elements:
+    if not lines:
         return None
+    curves = [line.curve.points for line in lines.values()]
+    sizes = np.array([len(curve) for curve in curves])
+    ends = np.cumsum(sizes)
+    points = np.concatenate(curves)
+    inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    if not len(inside):
+        return None
+    owner = np.repeat(np.arange(len(curves)), sizes)[inside]
     return LocalStations(
-        np.array(elements),
-        np.concatenate(owner),
-        np.concatenate(row),
-        np.concatenate(points),
-        np.concatenate(directions),
+        np.array(list(lines)),
+        owner,
+        inside - (ends - sizes)[owner],
+        points[inside] - low,
+        tangents_of_all(points, ends)[inside],
     )
 
 
@@ -97,40 +94,30 @@ def candidates(
     if not len(match.station):
         return []
     owner = local.owner[match.station]
-    count = np.bincount(owner, minlength=len(local.elements))
-    total = np.bincount(owner, weights=match.distance, minlength=len(local.elements))
+    count = np.bincount(owner)
+    beside = np.flatnonzero(count).tolist()
     # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
-    squares = np.bincount(owner, weights=match.distance**2, minlength=len(local.elements))
-    beside = np.flatnonzero(count)
-    fused = [lines[int(local.elements[i])].evidence.tracks.get(observation.track, 0) for i in beside]
+    counts, totals, squares = (
+        values.tolist()
+        for values in (count, np.bincount(owner, match.distance), np.bincount(owner, match.distance * match.distance))
+    )
+    elements = [int(local.elements[i]) for i in beside]
+    fused = [lines[element].evidence.tracks.get(observation.track, 0) for element in elements]
     most = max(max(fused), 1)
     found = []
-    for position, frames in zip(beside, fused, strict=True):
-        element = int(local.elements[position])
-        distance = float(total[position] / count[position])
-        shorter = min(len(curve), len(lines[element].curve))
-        if distance > config.match_distance or count[position] < min(
+    for position, element, frames in zip(beside, elements, fused, strict=True):
+        overlap = counts[position]
+        distance = totals[position] / overlap
+        shorter = min(len(curve), len(lines[element].curve.points))
+        if distance > config.match_distance or overlap < min(
             config.match_overlap / config.station_spacing, 0.5 * shorter
         ):
             continue
-        own = np.flatnonzero(owner == position)
-        mismatch = squares[position] / count[position] / config.match_distance**2
-        benefit = count[position] * max(1.0 - mismatch + TRACK_BONUS * frames / most, 0.01)
-        found.append(
-            Candidate(
-                element,
-                Correspondence(
-                    local.row[match.station[own]],
-                    match.vertex[own],
-                    match.offset[own],
-                    match.distance[own],
-                    match.same_way[own],
-                ),
-                float(count[position]),
-                distance,
-                float(benefit),
-            )
-        )
+        mismatch = squares[position] / overlap / config.match_distance**2
+        benefit = overlap * max(1.0 - mismatch + TRACK_BONUS * frames / most, 0.01)
+        own = match if len(beside) == 1 else match.rows(np.flatnonzero(owner == position))
+        at_element = replace(own, station=local.row[own.station])
+        found.append(Candidate(element, at_element, float(overlap), distance, benefit))
     return found
 
 

@@ -196,11 +196,13 @@ class MapIntegrator:
                 curve.information[vertex],
                 (*instant.car, _number(observation.track)),
             )
-        length = len(line.curve)
+        length, number = len(line.curve), line.first
         pieces = fuse(line, curve, match)
         line.evidence.sighted(observation.track, instant.timestamp, not first)
-        if len(line.curve) > length:
-            self.index.put(candidate.element, line.curve.points)
+        before = number - line.first
+        for grown in (line.curve.points[:before], line.curve.points[before + length :]):
+            if len(grown):
+                self.index.extend(candidate.element, grown)
         self._dirty.add(candidate.element)
         return pieces
 
@@ -245,10 +247,13 @@ class MapIntegrator:
         rooms = [room_of(observation.points, cell) for observation in observations]
         sightings: list[RingSighting] = []
         options: list[dict[int, float]] = []
+        corners = np.array([self.rings[i].corner for i in near], dtype=np.int64).reshape(-1, 2)
+        stops = np.array([self.rings[i].stop for i in near], dtype=np.int64).reshape(-1, 2)
         for observation, (low, high) in zip(observations, rooms, strict=True):
-            around = [i for i in near if (self.rings[i].corner < high).all() and (self.rings[i].stop > low).all()]
-            wide_low = np.min([low, *(self.rings[i].corner for i in around)], axis=0)
-            wide_high = np.max([high, *(self.rings[i].stop for i in around)], axis=0)
+            rows = np.flatnonzero(((corners < high) & (stops > low)).all(axis=1))
+            around = [near[row] for row in rows.tolist()]
+            wide_low = np.vstack([corners[rows], low]).min(axis=0)
+            wide_high = np.vstack([stops[rows], high]).max(axis=0)
             room = wide_low, wide_high
             sighting = sight(observation, room, frame_map.ego_to_global, frame_map.roi, cell, visible)
             shares = {i: overlap(self.rings[i], sighting) for i in around}
@@ -264,24 +269,28 @@ class MapIntegrator:
                 continue
             ring = self.rings[element]
             room = np.minimum(low, ring.corner), np.maximum(high, ring.stop)
+            grows = bool((room[0] < ring.corner).any() or (room[1] > ring.stop).any())
             fuse_ring(ring, sighting.crop(*room), frame_map.timestamp)
             for other in row:
                 if other != element and other not in chosen and other in self.rings:
-                    self._merge_rings(element, other)
-            self._file_ring(element)
+                    grows |= self._merge_rings(element, other)
+            if grows:
+                self._file_ring(element)
+            self._dirty.add(element)
 
-    def _merge_rings(self, keep: int, drop: int) -> None:
-        """Make one crossing of two that cover much the same ground."""
+    def _merge_rings(self, keep: int, drop: int) -> bool:
+        """Make one crossing of two that cover much the same ground; returns whether they do."""
         first, second = self.rings[keep], self.rings[drop]
         low, high = np.maximum(first.corner, second.corner), np.minimum(first.stop, second.stop)
         if (high <= low).any():
-            return
+            return False
         one, two = first.level(first.window(low, high)) > 0, second.level(second.window(low, high)) > 0
         if np.count_nonzero(one & two) < self.config.ring_overlap * np.count_nonzero(one | two):
-            return
+            return False
         merge_rings(first, self.rings.pop(drop))
         self.index.remove(drop)
         self._dirty.add(drop)
+        return True
 
     def _file_ring(self, element: int) -> None:
         ring = self.rings[element]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,12 @@ class Correspondence:
     offset: Float
     distance: Float
     same_way: NDArray[np.bool_]
+
+    def rows(self, rows: NDArray[np.intp]) -> Correspondence:
+        """Return some of the stations."""
+        return Correspondence(
+            self.station[rows], self.vertex[rows], self.offset[rows], self.distance[rows], self.same_way[rows]
+        )
 
 
 def tangents(points: Float) -> Float:
@@ -90,26 +98,61 @@ def correspond(
     )
     points = stations[near]
     # |p - q|² without |p|², which does not change which q is nearest
-    square = (curve**2).sum(axis=1)[None, :] - 2.0 * (points @ curve.T)
+    square = (curve[:, 0] ** 2 + curve[:, 1] ** 2) - 2.0 * (points @ curve.T)
     cosine = directions[near] @ curve_tangents.T
-    found = []
-    for sign in (1.0, -1.0):
-        vertex = np.argmin(np.where(sign * cosine > 0.0, square, np.inf), axis=1)
-        tangent = curve_tangents[vertex]
-        gap = curve[vertex] - points
-        along = (gap * tangent).sum(axis=1)
-        offset = gap - along[:, None] * tangent
-        distance = np.sqrt((offset**2).sum(axis=1))
-        aligned = sign * np.take_along_axis(cosine, vertex[:, None], axis=1)[:, 0] > np.cos(np.radians(angle))
-        past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
-        found.append((vertex, offset, distance, (distance < reach) & aligned & ~past & (np.abs(along) < reach)))
+    forwards = cosine > 0.0
+    one_way, any_way = np.asarray(forwards.all(axis=1)), np.asarray(forwards.any(axis=1))
     lines = owner[near]
     count = int(lines.max(initial=-1)) + 1
-    same, opposite = (
-        np.bincount(lines[keep], weights=reach - distance[keep], minlength=count) for _, _, distance, keep in found
-    )
-    way = (same >= opposite)[lines]
-    vertex, offset, distance, keep = (
-        np.where(way if a.ndim == 1 else way[:, None], a, b) for a, b in zip(*found, strict=True)
-    )
-    return Correspondence(near[keep], vertex[keep], offset[keep], distance[keep], way[keep])
+    feet = partial(_feet, points, cosine, curve, curve_tangents, reach, angle, end)
+    if np.array_equal(one_way, any_way):
+        # nothing folds back: each station has a nearest vertex of one way only
+        vertex, offset, distance, keep = feet(square, one_way)
+        weight = np.where(one_way, reach - distance, distance - reach)
+        way = (np.bincount(lines[keep], weights=weight[keep], minlength=count) >= 0.0)[lines]
+        keep &= way == one_way
+    else:
+        found = [
+            feet(np.where(forwards == ahead, square, np.inf), np.full(len(near), ahead)) for ahead in (True, False)
+        ]
+        same, opposite = (
+            np.bincount(lines[kept], weights=reach - away[kept], minlength=count) for _, _, away, kept in found
+        )
+        way = (same >= opposite)[lines]
+        vertex, offset, distance, keep = (
+            np.where(way if a.ndim == 1 else way[:, None], a, b) for a, b in zip(*found, strict=True)
+        )
+    kept = np.flatnonzero(keep)
+    return Correspondence(near[kept], vertex[kept], offset[kept], distance[kept], way[kept])
+
+
+def _feet(
+    points: Float,
+    cosine: Float,
+    curve: Float,
+    curve_tangents: Float,
+    reach: float,
+    angle: float,
+    end: float,
+    square: Float,
+    ahead: NDArray[np.bool_],
+) -> tuple[Integer, Float, Float, NDArray[np.bool_]]:
+    """Return nearest vertex, offset, distance, and which stations lie beside the curve.
+
+    Args:
+        points: ``(n, 2)``, metres.
+        cosine: ``(n, m)``, of the angle between station and vertex.
+        curve, curve_tangents, reach, angle, end: of :func:`correspond`.
+        square: ``(n, m)``, rises with the distance to each vertex.
+        ahead: ``(n,)``, whether the station must run along the curve or against it.
+    """
+    vertex = square.argmin(axis=1)
+    tangent = curve_tangents[vertex]
+    gap = curve[vertex] - points
+    along = gap[:, 0] * tangent[:, 0] + gap[:, 1] * tangent[:, 1]
+    offset = gap - along[:, None] * tangent
+    distance = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
+    turn = cosine[np.arange(len(points)), vertex]
+    aligned = np.where(ahead, turn, -turn) > math.cos(math.radians(angle))
+    past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
+    return vertex, offset, distance, (distance < reach) & aligned & ~past & (np.abs(along) < reach)

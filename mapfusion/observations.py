@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 
 from mapfusion.config import IntegratorConfig
 from mapfusion.curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, Curve
-from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
-from mapfusion.geometry import arc_length, transform_points
+from mapfusion.elements import ElementKind, FrameMap
+from mapfusion.geometry import transform_points
 from mapfusion.matching import tangents_of_all
 from mapfusion.uncertainty import place_mark, track_mark
 from mapfusion.views import view_weight
@@ -64,7 +65,9 @@ def pose_problem(ego_to_global: Float) -> str | None:
     if not np.isfinite(pose).all():
         return "pose is not finite"
     rotation = pose[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or determinant < 0:
         return "pose is not rigid"
     return None
 
@@ -88,28 +91,33 @@ def observe(
     Returns:
         Lines (clipped to the ROI, resampled) and rings.
     """
-    box = shapely.box(*(-frame_map.roi.size / 2), *(frame_map.roi.size / 2))
-    rows: list[int] = []
-    curves: list[Float] = []
-    for row in np.flatnonzero(frame_map.track_ids >= 0).tolist():
-        points = np.asarray(frame_map.polylines[row], dtype=np.float64)
-        problem = _element_problem(points, frame_map.kinds[row], frame_map.scores[row], config)
+    half = frame_map.roi.size / 2
+    box = shapely.box(*-half, *half)
+    line_rows: list[int] = []
+    ring_rows: list[int] = []
+    lines: list[Float] = []
+    rings: list[Float] = []
+    rows = np.flatnonzero(frame_map.track_ids >= 0).tolist()
+    polylines = [np.asarray(frame_map.polylines[row], dtype=np.float64) for row in rows]
+    extents = _extents(polylines, config)
+    for row, points, extent in zip(rows, polylines, extents, strict=True):
+        problem = _element_problem(int(frame_map.kinds[row]), float(frame_map.scores[row]), points, extent, config)
         if problem is not None:
             rejections[problem] += 1
             continue
-        ring = ElementKind(int(frame_map.kinds[row])).is_ring
-        pieces = _ring_pieces(points, box) if ring else _line_pieces(points, box, frame_map.roi)
+        ring = int(frame_map.kinds[row]) == ElementKind.PED_CROSSING
+        (left, rear), (right, front) = extent
+        within = max(-left, right) <= half[0] and max(-rear, front) <= half[1]
+        pieces = _ring_pieces(points, box, within) if ring else _line_pieces(points, box, within)
         if not pieces:
             rejections["ring without area" if ring else "outside the region of interest"] += 1
-        for piece in pieces:
-            curve = piece if ring else _stations(piece, config.station_spacing)
-            if curve is None:
-                rejections["line without length"] += 1
-                continue
-            rows.append(row)
-            curves.append(curve)
-    observations = _observations(frame_map, rows, curves, config, log, visible)
-    return [o for o in observations if not o.kind.is_ring], [o for o in observations if o.kind.is_ring]
+        (rings if ring else lines).extend(pieces)
+        (ring_rows if ring else line_rows).extend([row] * len(pieces))
+    curves = _stations(lines, config.station_spacing)
+    rejections.update({"line without length": len(lines) - len(curves)} if len(curves) < len(lines) else {})
+    used = [line_rows[number] for number in curves] + ring_rows
+    observations = _observations(frame_map, used, [*curves.values(), *rings], config, log, visible)
+    return observations[: len(curves)], observations[len(curves) :]
 
 
 def _observations(
@@ -170,30 +178,47 @@ def _looked_at(
     return np.where(ring, whole, view_weight(local, frame_map.roi, config, visible))
 
 
-def _element_problem(points: Float, kind: int, score: float, config: IntegratorConfig) -> str | None:
+def _well_formed(points: Float, config: IntegratorConfig) -> bool:
+    return points.ndim == 2 and points.shape[1] == 2 and 2 <= len(points) <= config.max_points
+
+
+def _extents(polylines: list[Float], config: IntegratorConfig) -> list[list[list[float]]]:
+    """Return the least and the largest coordinates of each polyline, all at once; NaN for those that are no lines."""
+    formed = [number for number, points in enumerate(polylines) if _well_formed(points, config)]
+    extents = np.full((len(polylines), 2, 2), np.nan)
+    if formed:
+        sizes = np.array([len(polylines[number]) for number in formed])
+        points, first = np.concatenate([polylines[number] for number in formed]), np.cumsum(sizes) - sizes
+        extents[formed, 0] = np.minimum.reduceat(points, first)
+        extents[formed, 1] = np.maximum.reduceat(points, first)
+    plain: list[list[list[float]]] = extents.tolist()
+    return plain
+
+
+def _element_problem(
+    kind: int, score: float, points: Float, extent: list[list[float]], config: IntegratorConfig
+) -> str | None:
     if kind not in (0, 1, 2):
         return "unknown kind"
-    if not (np.isfinite(score) and 0.0 <= score <= 1.0):
+    if not 0.0 <= score <= 1.0:
         return "score outside [0, 1]"
-    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
-        return "fewer than two points"
-    if len(points) > config.max_points:
-        return "too many points"
-    if not np.isfinite(points).all():
+    if not _well_formed(points, config):
+        return "too many points" if points.ndim == 2 and len(points) > config.max_points else "fewer than two points"
+    if not all(math.isfinite(value) for corner in extent for value in corner):
         return "points not finite"
-    if not np.ptp(points, axis=0).any():
+    if extent[0] == extent[1]:
         return "line without length"
     return None
 
 
-def _line_pieces(points: Float, box: shapely.Polygon, roi: RegionOfInterest) -> list[Float]:
-    if (np.abs(points) <= roi.size / 2).all():
+def _line_pieces(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:
+    if within:
         return [points]
     inside = shapely.line_merge(shapely.intersection(shapely.LineString(points), box))
     return [shapely.get_coordinates(part) for part in shapely.get_parts(inside) if part.geom_type == "LineString"]
 
 
-def _ring_pieces(points: Float, box: shapely.Polygon) -> list[Float]:
+def _ring_pieces(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:
     """Clip a ring; one that crosses itself is repaired and its largest part kept."""
     if len(points) < 3:
         return []
@@ -202,7 +227,7 @@ def _ring_pieces(points: Float, box: shapely.Polygon) -> list[Float]:
         polygon = shapely.make_valid(polygon, method="structure", keep_collapsed=False)
     parts = [
         part
-        for part in shapely.get_parts(shapely.intersection(polygon, box))
+        for part in shapely.get_parts(polygon if within else shapely.intersection(polygon, box))
         if part.geom_type == "Polygon" and part.area > 0.1
     ]
     if not parts:
@@ -210,10 +235,28 @@ def _ring_pieces(points: Float, box: shapely.Polygon) -> list[Float]:
     return [shapely.get_coordinates(max(parts, key=lambda part: part.area).exterior)]
 
 
-def _stations(points: Float, spacing: float) -> Float | None:
-    distance = arc_length(points)
-    if distance[-1] < spacing / 2:
-        return None
-    count = max(round(distance[-1] / spacing), 1) + 1
-    at = np.arange(count) * (distance[-1] / (count - 1))
-    return np.stack([np.interp(at, distance, points[:, 0]), np.interp(at, distance, points[:, 1])], axis=1)
+def _stations(lines: list[Float], spacing: float) -> dict[int, Float]:
+    """Resample lines ``(k, 2)`` about every ``spacing`` metres, both ends included, all at once.
+
+    Returns:
+        Stations by number of the line; those without length are missing.
+    """
+    if not lines:
+        return {}
+    points = np.concatenate(lines)
+    sizes = np.array([len(line) for line in lines])
+    first = np.cumsum(sizes) - sizes
+    step = np.diff(points, axis=0, prepend=points[:1])
+    step[first] = 0.0
+    total = np.cumsum(np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2))
+    start, length = total[first], total[first + sizes - 1] - total[first]
+    long = length >= spacing / 2
+    count = np.where(long, np.maximum(np.rint(length / spacing), 1) + 1, 0).astype(np.int64)
+    # one abscissa for all: a line begins well past where the one before it ends
+    apart = np.arange(len(lines)) * spacing
+    stops = np.cumsum(count)
+    number = np.arange(stops[-1]) - np.repeat(stops - count, count)
+    at = np.repeat(start + apart, count) + number * np.repeat(length / np.maximum(count - 1, 1), count)
+    along = total + np.repeat(apart, sizes)
+    stations = np.stack([np.interp(at, along, points[:, 0]), np.interp(at, along, points[:, 1])], axis=1)
+    return {line: stations[stops[line] - count[line] : stops[line]] for line in np.flatnonzero(long).tolist()}

@@ -81,13 +81,19 @@ class FusedRing:
         before, after = self.corner - low, high - self.stop
         if not (before.any() or after.any()):
             return
-        width = ((int(before[0]), int(after[0])), (int(before[1]), int(after[1])))
         inner = tuple(slice(a, a + n) for a, n in zip(before.tolist(), self.looked.shape, strict=True))
-        looked = np.pad(self.looked, width, mode="edge")
+        rows, columns = (
+            np.arange(low[axis] - self.corner[axis], high[axis] - self.corner[axis]).clip(
+                0, self.looked.shape[axis] - 1
+            )
+            for axis in range(2)
+        )
+        edge = np.ix_(rows, columns)
+        looked = self.looked[edge]
         distance = -np.float32(TRUNCATION) * looked
         distance[inner] = self.distance
         self.looked, self.distance = looked, distance
-        self.seen_view = np.pad(self.seen_view, width, mode="edge")
+        self.seen_view = self.seen_view[edge]
         self.corner = low
 
     def window(self, corner: Integer, stop: Integer) -> Window:

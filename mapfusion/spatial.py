@@ -34,6 +34,13 @@ class TileIndex:
             self._elements.setdefault(tile, set()).add(element)
         self._tiles[element] = tiles
 
+    def extend(self, element: int, points: Float) -> None:
+        """File an element that is known already under the tiles of further points ``(n, 2)``."""
+        tiles = set(_key(np.floor(points / TILE_SIZE).astype(np.int64)).tolist())
+        for tile in tiles - self._tiles[element]:
+            self._elements.setdefault(tile, set()).add(element)
+            self._tiles[element].add(tile)
+
     def remove(self, element: int) -> None:
         """Forget an element."""
         for tile in self._tiles.pop(element):

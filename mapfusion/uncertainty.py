@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
 Marks = NDArray[np.uint64]
+Record = tuple[int, Integer, Float, Float, Float, tuple[float, ...]]
 
 PLACE = 5.0
 """Side of the cells in which it is noted from where the car saw a station, metres."""
@@ -56,11 +57,14 @@ PROBE_SPACING = 8
 CAPACITY = 4096
 """Records are compared and forgotten when there are so many."""
 
-COMPANIONS = 12
-"""Each record is compared with at most so many others of its station."""
+COMPANIONS = (1, 2, 3, 5, 8, 13)
+"""Each record is compared with those of its station that came so many records later."""
 
 OUTLIER = 9.0 / 0.455
 """Squared differences count as at most so many medians: three deviations of a normal distribution."""
+
+SCRAMBLE = np.array([1.0, 1e5 + 0.7])
+"""Makes one number of two, different ones for different pairs."""
 
 LEAST_VARIANCE = 1e-3
 """No detector is better than this, as a multiple of the variance that it is assumed to have."""
@@ -101,7 +105,7 @@ class ErrorModel:
     lags: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
     pairs: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
     contrasts: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
-    _records: list[Float] = field(default_factory=list)
+    _records: list[Record] = field(default_factory=list)
     _count: int = 0
 
     def note(
@@ -123,11 +127,8 @@ class ErrorModel:
             weight: ``(n,)``, information of the detection, 1 / m².
             seen_from: where the car was, two coordinates in metres, and the track's number.
         """
-        record = np.empty((len(numbers), 10))
-        record[:, 0], record[:, 1] = element, numbers
-        record[:, 2:4], record[:, 4:6], record[:, 6], record[:, 7:] = feet, directions, weight, seen_from
-        self._records.append(record)
-        self._count += len(record)
+        self._records.append((element, numbers, feet, directions, weight, seen_from))
+        self._count += len(numbers)
         if self._count >= CAPACITY:
             self.learn()
 
@@ -135,14 +136,26 @@ class ErrorModel:
         """Take the differences between the records kept so far, and forget them."""
         if not self._records:
             return
-        records = np.concatenate(self._records)
+        elements, numbers, feet, directions, weight, seen_from = zip(*self._records, strict=True)
+        sizes = [len(part) for part in numbers]
+        number = np.concatenate(numbers)
+        order = np.lexsort((number, np.repeat(elements, sizes)))
+        records = np.column_stack(
+            [
+                np.repeat(elements, sizes),
+                number,
+                np.concatenate(feet),
+                np.concatenate(directions),
+                np.concatenate(weight),
+                np.repeat(np.array(seen_from), sizes, axis=0),
+            ]
+        )[order]
         self._records, self._count = [], 0
-        records = records[np.lexsort((records[:, 1], records[:, 0]))]
         seen: list[Float] = []
-        for step in range(1, COMPANIONS + 1):
+        for step in COMPANIONS:
             one, two = records[:-step], records[step:]
-            same = (one[:, :2] == two[:, :2]).all(axis=1)
-            if not same.any():
+            same = np.flatnonzero((one[:, 0] == two[:, 0]) & (one[:, 1] == two[:, 1]))
+            if not len(same):
                 break
             one, two = one[same], two[same]
             gap = one[:, 2:4] - two[:, 2:4]
@@ -151,24 +164,23 @@ class ErrorModel:
             lag = np.hypot(one[:, 7] - two[:, 7], one[:, 8] - two[:, 8])
             # differences of one track from places less than a lag apart hang together, as do all of two tracks
             other = one[:, 9] != two[:, 9]
-            block = one[:, 7:9] // np.maximum(lag, PLACE)[:, None]
-            tracks = np.sort(np.stack([one[:, 9], two[:, 9]], axis=1), axis=1)
-            source = np.where(other[:, None], tracks, block)
-            seen.append(np.column_stack([other, lag, square, one[:, 0], source]))
+            block = np.floor(one[:, 7:9] / np.maximum(lag, PLACE)[:, None]) @ SCRAMBLE
+            tracks = one[:, 9] + two[:, 9]
+            seen.append(np.column_stack([other, lag, square, one[:, 0] * SCRAMBLE[1] + np.where(other, tracks, block)]))
         if seen:
             self._count_in(np.concatenate(seen))
 
     def _count_in(self, pairs: Float) -> None:
-        """Add pairs: other track or not, lag, squared difference, and three numbers for the contrast they belong to."""
-        other, lag, square = pairs[:, :3].T
+        """Add pairs: other track or not, lag, squared difference, and a number for the contrast they belong to."""
+        other, lag, square, contrast = pairs.T
         # two lines taken for one, or a ghost beside a line, say nothing of the detector's error
         square = np.minimum(square, OUTLIER * np.median(square))
         group = other.astype(np.int64) * (len(LAGS) - 1) + np.searchsorted(LAGS, lag, side="right") - 1
         shape = self.pairs.shape
         for total, values in ((self.squares, square), (self.lags, lag), (self.pairs, np.ones_like(lag))):
             total += np.bincount(group, weights=values, minlength=total.size).reshape(shape)
-        contrast = np.unique(np.column_stack([group, pairs[:, 3:]]), axis=0)[:, 0].astype(np.int64)
-        self.contrasts += np.bincount(contrast, minlength=self.contrasts.size).reshape(shape)
+        different = np.unique(group + 1j * contrast).real.astype(np.int64)
+        self.contrasts += np.bincount(different, minlength=self.contrasts.size).reshape(shape)
 
     def state(self) -> Float:
         """Return what was learnt, as one array for :meth:`from_state`; the records kept are taken in first."""
