@@ -17,7 +17,10 @@ def diff(
     old: Annotated[Path, typer.Argument(help="The map as it was.")],
     new: Annotated[Path, typer.Argument(help="The map of a later drive.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Differences to write (GeoJSON).")] = None,
-    tolerance: Annotated[float, typer.Option(min=0.05, help="What moved less is unchanged, metres.")] = 0.5,
+    tolerance: Annotated[
+        float,
+        typer.Option(min=0.05, help="What moved less, or within both maps' uncertainty, is unchanged, metres."),
+    ] = 0.5,
     align: Annotated[bool, typer.Option(help="Take out an offset between the two drives where it is certain.")] = True,
 ) -> None:
     """Say what was added, removed or moved from one map to another, and what the new drive did not see."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.coverage import coverage, inside
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.export.geojson import DECIMALS, Georeference, InvertibleGeoreference
+from mapfusion.geometry import arc_length
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
 
 Float = NDArray[np.float64]
@@ -46,6 +47,8 @@ class DiffConfig:
 
     Attributes:
         tolerance: a stretch that lies within this distance of where it was is unchanged, metres.
+        sure: it has moved only if it lies farther off than so many standard deviations of the distance, as far as the
+            maps state how well they know each line's place.
         reach: one that lies farther off than this is not the same line any more, metres.
         ring_reach: the same for the centre of a crossing, metres.
         ring_overlap: crossings whose intersection over union is at least this are unchanged.
@@ -56,6 +59,7 @@ class DiffConfig:
     """
 
     tolerance: float = 0.5
+    sure: float = 1.96
     reach: float = 2.0
     ring_reach: float = 4.0
     ring_overlap: float = 0.6
@@ -124,8 +128,10 @@ def diff_maps(
     """Compare two maps in one metric frame.
 
     Lines are compared sample by sample along their length; a stretch of the new map answers for one stretch of the
-    old one only, so that a double line that became a single one shows. What the old map has and the new one lacks is
-    removed where the new map's drive has looked (:func:`mapfusion.coverage.coverage`), else unobserved.
+    old one only, so that a double line that became a single one shows. What lies farther off than
+    :attr:`DiffConfig.tolerance` has moved, unless that is within what the maps state of their own uncertainty. What
+    the old map has and the new one lacks is removed where the new map's drive has looked
+    (:func:`mapfusion.coverage.coverage`), else unobserved.
 
     Args:
         old, new: the maps, metres.
@@ -188,10 +194,7 @@ def _feature(item: Difference, georeference: Georeference) -> dict[str, Any]:
 
 
 def _moved(global_map: GlobalMap, alignment: Alignment) -> GlobalMap:
-    elements = tuple(
-        MapElement(e.kind, alignment.apply(e.points), e.confidence, e.observations, e.first_seen, e.last_seen)
-        for e in global_map
-    )
+    elements = tuple(replace(element, points=alignment.apply(element.points)) for element in global_map)
     return GlobalMap(elements, global_map.provenance)
 
 
@@ -206,7 +209,9 @@ def _compare_lines(
     after = sample_lines([element.points for element in new], config.spacing)
     forward = pair(before, after, config.reach)
     backward = pair(after, before, config.reach)
-    near = np.nan_to_num(forward.distance, nan=np.inf) <= config.tolerance
+    variance = _variance(old, before) + np.append(_variance(new, after), 0.0)[forward.partner]
+    limit = np.maximum(config.tolerance, config.sure * np.sqrt(variance))
+    near = np.nan_to_num(forward.distance, nan=np.inf) <= limit
     states = np.full(len(before), ORDER.index(Change.UNOBSERVED))
     states[inside(ground, before.points)] = ORDER.index(Change.REMOVED)
     states[forward.found] = ORDER.index(Change.MOVED)
@@ -215,6 +220,16 @@ def _compare_lines(
     # of the new map only what nothing in the old one answers for
     states = np.where(backward.found, -1, ORDER.index(Change.ADDED))
     return found + _stretches(kind, new, after, backward, states, config)
+
+
+def _variance(elements: Sequence[MapElement], samples: Samples) -> Float:
+    """Return the variance across the line at each sample, ``(n,)``, m²; 0 where the map does not state it."""
+    variance = np.zeros(len(samples))
+    for line, element in enumerate(elements):
+        if element.deviation is not None:
+            rows = slice(*samples.bounds(line))
+            variance[rows] = np.interp(samples.station[rows], arc_length(element.points), element.deviation) ** 2
+    return variance
 
 
 def _stretches(
@@ -296,7 +311,8 @@ def _compare_rings(
             change, shift, shown = (Change.REMOVED if seen else Change.UNOBSERVED), float("nan"), element
         else:
             shift = distance[i, partner]
-            same = shift <= config.tolerance or overlap[i, partner] >= config.ring_overlap
+            limit = max(config.tolerance, config.sure * float(np.hypot(_spread(element), _spread(new[partner]))))
+            same = shift <= limit or overlap[i, partner] >= config.ring_overlap
             change, shown = (Change.UNCHANGED, element) if same else (Change.MOVED, new[partner])
         result.append(Difference(change, kind, shown.points, shown.length, shift, shown.confidence))
     missing = (element for j, element in enumerate(new) if j not in taken_new)
@@ -304,6 +320,11 @@ def _compare_rings(
         Difference(Change.ADDED, kind, element.points, element.length, float("nan"), element.confidence)
         for element in missing
     ]
+
+
+def _spread(ring: MapElement) -> float:
+    """Return how well the place of a crossing is known, metres; 0 where the map does not state it."""
+    return 0.0 if ring.deviation is None else float(np.median(ring.deviation))
 
 
 def _polygon(element: MapElement) -> shapely.Geometry:

@@ -123,7 +123,9 @@ class MapElement:
         observations: number of frames that saw it.
         first_seen, last_seen: integer nanoseconds.
         track_ids: ids of the tracks that were fused into it, ascending.
-        deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known.
+        deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known: 95 % of the
+            true curve lies within 1.96 deviations of this one, measured across it. What of the detector's error does
+            not average out is in it (:mod:`mapfusion.uncertainty`); an offset of the poses as a whole is not.
         sources: names of the maps that it was merged from, ascending; empty for a map of one drive.
     """
 

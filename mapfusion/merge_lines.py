@@ -50,6 +50,7 @@ class MergeConfig:
         match_distance: stretches of different maps are one line if they lie this close, metres.
         min_new: a stretch shorter than this beside a known line is noise, metres.
         default_deviation: of a line whose file states none and that one frame saw, metres.
+        default_alike: share in the variance of such a line that is the same in all frames of a drive.
         floor_deviation: no map is trusted to be better than this, since its poses err as a whole, metres.
         miss_log_odds: what it takes from a line that a map which looked there lacks it.
         log_odds_limit: more evidence than this from one map does not make it surer.
@@ -64,6 +65,7 @@ class MergeConfig:
     match_distance: float = 1.5
     min_new: float = 2.0
     default_deviation: float = 0.4
+    default_alike: float = 0.1
     floor_deviation: float = 0.05
     miss_log_odds: float = 0.7
     log_odds_limit: float = 4.0
@@ -95,9 +97,8 @@ def information(element: MapElement, config: MergeConfig) -> Float:
     """Inverse variance of a line at its vertices, ``(n,)``, 1 / m²: from the file, or from the number of frames."""
     deviation = element.deviation
     if deviation is None:
-        deviation = np.full(
-            len(element.points), config.default_deviation / np.sqrt(np.clip(element.observations, 1, 20))
-        )
+        alike = config.default_alike + (1.0 - config.default_alike) / max(element.observations, 1)
+        deviation = np.full(len(element.points), config.default_deviation * np.sqrt(alike))
     return np.asarray(1.0 / (deviation**2 + config.floor_deviation**2))
 
 

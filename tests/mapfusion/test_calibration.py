@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from mapfusion import ElementKind, GlobalMap, MapIntegrator
+from mapfusion.diff import Change, DiffConfig, diff_maps
+from mapfusion.merge import merge_maps
 from mapfusion.uncertainty import CAPACITY, LASTING, PROBE_SPACING, ErrorModel, distinct, place_mark, track_mark
 from tests.mapfusion.argoverse import LOGS
-from tests.mapfusion.calibration import CORRELATIONS, drives_of, errors_of, share_inside
+from tests.mapfusion.calibration import CORRELATIONS, drives_of, errors_of, share_inside, standard_errors
+from tests.mapfusion.simulation import simulate, town_road
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.3, 0.5])
@@ -24,6 +30,38 @@ def test_real_roads_lie_within_the_stated_band(errors):
         pytest.skip(f"no Argoverse 2 logs in {LOGS}: set PREDMAPNET_REFERENCE")
     drives = drives_of("Argoverse 2", CORRELATIONS[errors].scaled(0.3), 40, range(50, 54))
     assert 0.90 <= share_inside(errors_of(drives)) <= 0.98
+
+
+def test_two_maps_of_one_place_have_not_moved_apart_beyond_their_uncertainty():
+    truth, road = town_road(np.random.default_rng(7))
+    maps = []
+    for seed in (0, 1):
+        poses = [road.pose(30.0 + 4.5 * number, -1.75) for number in range(30)]
+        detector = CORRELATIONS["both"].scaled(0.4)
+        integrator = MapIntegrator()
+        for frame in simulate(truth, poses, np.random.default_rng(seed), detector).frames:
+            integrator.add(frame)
+        maps.append(integrator.map())
+    bare = [GlobalMap(tuple(replace(element, deviation=None) for element in one)) for one in maps]
+    config = DiffConfig(tolerance=0.2, align=False)
+    honest, blind = diff_maps(*maps, config=config), diff_maps(*bare, config=config)
+    moved, guessed = (sum(found.metres(Change.MOVED, kind) for kind in ElementKind) for found in (honest, blind))
+    length = sum(element.length for element in maps[0])
+    assert moved < 0.15 * length < guessed
+
+
+def test_a_merged_map_lies_within_its_stated_band():
+    truth, road = town_road(np.random.default_rng(8))
+    poses = [road.pose(30.0 + 4.5 * number, -1.75) for number in range(30)]
+    maps = []
+    for seed in range(3):
+        drive = simulate(truth, poses, np.random.default_rng(seed), CORRELATIONS["both"])
+        integrator = MapIntegrator()
+        for frame in drive.frames:
+            integrator.add(frame)
+        maps.append(integrator.map())
+    merged = merge_maps(maps)[0]
+    assert 0.88 <= share_inside(standard_errors(merged, drive)) <= 0.995
 
 
 def learnt(new: float, lasting: float, track: float, frames: int = 12, elements: int = 300) -> np.ndarray:

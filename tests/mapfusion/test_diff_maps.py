@@ -99,6 +99,37 @@ def test_a_crossing_that_moved_says_how_far():
     assert found.moved_by(CROSSING) == pytest.approx(2.5)
 
 
+def test_what_lies_within_the_uncertainty_of_the_maps_has_not_moved():
+    road = [[0, 0], [100, 0]]
+    moved = [[0, 0.9], [100, 0.9]]
+
+    def metres(old_deviation, new_deviation, points=moved):
+        old, new = (
+            GlobalMap((replace(line(p), deviation=None if d is None else np.full(2, d)),))
+            for p, d in ((road, old_deviation), (points, new_deviation))
+        )
+        return diff_maps(old, new, config=DiffConfig(align=False)).metres(Change.MOVED, DIVIDER)
+
+    assert metres(None, None) == pytest.approx(100.0)
+    assert metres(0.1, 0.1) == pytest.approx(100.0)
+    assert metres(0.4, 0.4) == 0.0
+    assert metres(0.6, None) == 0.0
+    # one end of the line is known well, the other is not
+    sloping = replace(line(road), deviation=np.array([0.05, 1.0]))
+    found = diff_maps(GlobalMap((sloping,)), GlobalMap((line(moved),)), config=DiffConfig(align=False))
+    assert found.metres(Change.MOVED, DIVIDER) == pytest.approx(43.0, abs=3.0)
+
+
+def test_a_crossing_that_lies_within_its_uncertainty_has_not_moved():
+    ring = np.array([[20, 0], [24, 0], [24, 7], [20, 7], [20, 0]], dtype=float)
+    for deviation, moved in ((0.2, 1), (0.8, 0)):
+        old, new = (
+            GlobalMap((replace(line(points, CROSSING), deviation=np.full(5, deviation)),))
+            for points in (ring, ring + np.array([1.6, 0.0]))
+        )
+        assert diff_maps(old, new, config=DiffConfig(align=False)).count(Change.MOVED, CROSSING) == moved
+
+
 def test_one_line_does_not_stand_for_two():
     double = GlobalMap((line([[0, 0.15], [100, 0.15]]), line([[0, -0.15], [100, -0.15]])))
     single = GlobalMap((line([[0, 0.1], [100, 0.1]]),))
