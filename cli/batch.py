@@ -35,7 +35,7 @@ def batch(
     from predmapnet.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
     from predmapnet.datasets.selection import open_source
     from predmapnet.threads import available_cores
-    from predmapnet.weights.checkpoint import weights_hash
+    from predmapnet.weights.files import weights_hash
 
     names = list(scenes or [])
     if len(names) == 1 and Path(names[0]).is_dir():

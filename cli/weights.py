@@ -20,39 +20,65 @@ weights = typer.Typer(
 def import_weights(
     checkpoint: Annotated[Path, typer.Argument(help="Checkpoint that MapTracker published (.pth).", metavar="FILE")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write (.safetensors).")],
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            help="MapTracker as it is (maptracker-nuscenes, maptracker-av2; by default as the file says), or under the "
+            "modules of the paper (paper-nuscenes, paper-av2), or a JSON file.",
+            show_default=False,
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the modules of the paper, which MapTracker has no weights for.")] = 0,
 ) -> None:
     """Turn a MapTracker checkpoint into weights for PredMapNet.
 
-    Nothing in the file is executed; entries that do not fit are an error.
+    Map with them (`predmapnet infer --weights FILE`), or go on training. With the modules of the paper they have to be
+    trained before they map well, since the modules begin at random.
+
+    Nothing in the checkpoint is executed; entries that do not fit are an error.
     """
+    from predmapnet.config import load_config
     from predmapnet.errors import UserError
     from predmapnet.files import check_output
 
     if out.suffix != ".safetensors":
         raise UserError(f"Weights are written as safetensors: name a file that ends so, not {out.name}.")
     check_output(out)
-    from predmapnet.weights.checkpoint import save_checkpoint, weights_hash
+    config = None if preset is None else load_config(preset)
+    from predmapnet.weights.checkpoint import save_checkpoint
+    from predmapnet.weights.files import weights_hash
+    from predmapnet.weights.inspection import parts_of
     from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint
 
-    network, report = import_maptracker(read_official_checkpoint(checkpoint))
-    facts = {"imported_from": checkpoint.name, "sha256_of_source": weights_hash(checkpoint)}
+    network, report = import_maptracker(read_official_checkpoint(checkpoint), config, seed)
+    facts: dict[str, object] = {"imported_from": checkpoint.name, "sha256_of_source": weights_hash(checkpoint)}
+    if report.fresh:
+        facts |= {"untrained": parts_of(report.fresh), "seed": seed}
     save_checkpoint(out, network, facts)
-    _say_import(report, out)
+    _say_import(report, network.config.name, out)
 
 
 @weights.command("inspect")
 def inspect_weights(
-    file: Annotated[Path, typer.Argument(help="Weights (.safetensors).", metavar="FILE")],
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Weights (.safetensors); those that come with PredMapNet if none are named.",
+            metavar="[FILE]",
+            show_default=False,
+        ),
+    ] = None,
     names: Annotated[bool, typer.Option("--names", help="List every tensor.")] = False,
 ) -> None:
-    """Show what a weights file holds: the network, its parts, and where it comes from."""
+    """Show what a weights file holds: the network, its modules and parts, and where it comes from."""
     from predmapnet.weights.inspection import inspect_file
 
     _say_weights(inspect_file(file), names)
 
 
-def _say_import(report: ImportReport, path: Path) -> None:
+def _say_import(report: ImportReport, name: str, path: Path) -> None:
     from cli.console import out
+    from predmapnet.weights.inspection import parts_of
 
     out.print(f"{len(report.mapped)} entries mapped, none unexplained", markup=False)
     reasons: dict[str, int] = {}
@@ -63,7 +89,10 @@ def _say_import(report: ImportReport, path: Path) -> None:
         out.print(f"{count} ignored: {reason}", markup=False)
     if report.missing:
         out.print(f"{len(report.missing)} missing that inference does without (counters of batches)", markup=False)
-    out.print(f"written: {path}", markup=False)
+    if report.fresh:
+        parts = ", ".join(parts_of(report.fresh))
+        out.print(f"{len(report.fresh)} tensors begin at random and have to be trained: {parts}", markup=False)
+    out.print(f"{name} written: {path}", markup=False)
 
 
 def _say_weights(info: WeightsInfo, names: bool) -> None:
@@ -76,8 +105,10 @@ def _say_weights(info: WeightsInfo, names: bool) -> None:
         out.print(f"{about['configuration']['name']}, written by predmapnet {about['version']}", markup=False)
     else:
         out.print("not written by PredMapNet", markup=False)
-    for name, value in dict(about.get("facts", {})).items():
-        out.print(f"{name.replace('_', ' ')}: {value}", markup=False)
+    facts = {"modules of the paper": info.modules or "none"} if info.modules is not None else {}
+    for name, value in (facts | dict(about.get("facts", {})) | {"sha256": info.sha256}).items():
+        said = ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+        out.print(f"{name.replace('_', ' ')}: {said}", markup=False, soft_wrap=True)
     table = Table("tensor" if names else "part", show_edge=False, pad_edge=False)
     if names:
         table.add_column("shape")

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from mapfusion.elements import RegionOfInterest
+from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 
 Positive = Annotated[int, Field(gt=0)]
@@ -124,7 +125,7 @@ class BevFormerConfig(Section):
         rows: of the BEV grid, along y.
         columns: of the BEV grid, along x.
         width: channels of the BEV features.
-        cameras: number and order matter, since each has a learned code.
+        cameras: their names; each has a learned code, so that a rig is put into this order.
         pillar_low: lowest of the heights at which a cell looks into the images, metres in the ego frame.
         pillar_high: highest of them.
         pillar_points: number of heights.
@@ -138,7 +139,7 @@ class BevFormerConfig(Section):
     layers: Positive = 2
     hidden: Positive = 512
     dropout: Fraction = 0.1
-    cameras: Positive = 6
+    cameras: Annotated[tuple[str, ...], Field(min_length=1)] = NUSCENES_CAMERAS
     pillar_low: float = -2.5
     pillar_high: float = 4.5
     pillar_points: Positive = 4
@@ -448,7 +449,7 @@ class PredMapNetConfig(Section):
         return self.model_dump_json()
 
 
-def _maptracker(name: str, image: WholeImageConfig, cameras: int) -> PredMapNetConfig:
+def _maptracker(name: str, image: WholeImageConfig, cameras: tuple[str, ...]) -> PredMapNetConfig:
     """Return the baseline: none of the paper's modules, and the sizes and thresholds of the released weights."""
     return PredMapNetConfig(
         name=name,
@@ -493,8 +494,8 @@ def _paper(name: str, baseline: PredMapNetConfig) -> PredMapNetConfig:
     return baseline.model_copy(update=changes)
 
 
-_NUSCENES = _maptracker("maptracker-nuscenes", WholeImageConfig(), cameras=6)
-_ARGOVERSE2 = _maptracker("maptracker-av2", WholeImageConfig(width=608, height=608), cameras=7)
+_NUSCENES = _maptracker("maptracker-nuscenes", WholeImageConfig(), NUSCENES_CAMERAS)
+_ARGOVERSE2 = _maptracker("maptracker-av2", WholeImageConfig(width=608, height=608), ARGOVERSE2_CAMERAS)
 PRESETS = {
     config.name: config
     for config in (

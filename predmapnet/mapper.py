@@ -19,6 +19,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.rig_geometry import arranged_rig
 from predmapnet.network.tracking import select
 from predmapnet.weights.checkpoint import load_checkpoint
 
@@ -33,7 +34,7 @@ class CameraImages:
     """Images of one instant as the network wants them.
 
     Attributes:
-        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the rig; black where there is no image.
+        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the network; black where there is no image.
         valid: ``(N,) bool``.
     """
 
@@ -99,10 +100,12 @@ class Mapper:
             allow_missing_cameras: mask cameras without an image out instead of failing.
 
         Raises:
-            UserError: an image is missing, damaged, or not of its camera's size.
+            UserError: an image is missing, damaged, or not of its camera's size, or the car has other cameras than the
+                network has learned.
         """
         images: dict[str, Image] = {}
-        for camera in frame.rig:
+        rig = arranged_rig(frame.rig, self.config)
+        for camera in rig:
             path = frame.images.get(camera.name)
             if path is None or not path.exists():
                 if not allow_missing_cameras:
@@ -113,7 +116,7 @@ class Mapper:
             raise UserError(
                 f"Frame {frame.index} of {frame.scene} has no image of any camera: there is nothing to map."
             )
-        windows, valid = stack_windows(images, frame.rig, self.config.image)
+        windows, valid = stack_windows(images, rig, self.config.image)
         return CameraImages(windows, valid)
 
     @torch.no_grad()
@@ -137,7 +140,8 @@ class Mapper:
             The map of this instant, and the state for the next step. ``state`` itself is not changed.
 
         Raises:
-            UserError: an image is missing, damaged, or not of its camera's size.
+            UserError: an image is missing, damaged, or not of its camera's size, or the car has other cameras than the
+                network has learned.
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
@@ -148,7 +152,7 @@ class Mapper:
         )
         if state is None:
             state = self.network.initial_state(1)
-        outputs = self.network(inputs, self._lookup(frame.rig), state)
+        outputs = self.network(inputs, self._lookup(arranged_rig(frame.rig, self.config)), state)
         selection = select(outputs, state, self.config)
         state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
         frame_map = to_frame_map(

@@ -173,7 +173,7 @@ class BevFormer(nn.Module):
         self.row_code = nn.Parameter(torch.rand(bev.rows, width // 2))
         self.column_code = nn.Parameter(torch.rand(bev.columns, width // 2))
         self.level_code = nn.Parameter(torch.randn(LEVEL_CODES, width))
-        self.camera_code = nn.Parameter(torch.randn(bev.cameras, width))
+        self.camera_code = nn.Parameter(torch.randn(len(bev.cameras), width))
         past_maps, mirrored = len(config.temporal_bev.distances), config.quirks.mirrored_self_attention
         self.layers = nn.ModuleList(BevEncoderLayer(bev, past_maps, mirrored) for _ in range(bev.layers))
 

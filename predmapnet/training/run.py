@@ -24,7 +24,8 @@ from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
 from predmapnet.training.validation import validate
 from predmapnet.training.workers import Workers
-from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint, weights_hash
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
+from predmapnet.weights.files import weights_hash
 
 Report = Callable[[str], None]
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +21,8 @@ from predmapnet.config import parse_config
 from predmapnet.errors import UserError
 from predmapnet.files import write_whole
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.weights.files import KEY, existing_weights, weights_hash
 
-SHIPPED = Path(__file__).with_name("lite.safetensors")
-"""The weights that come with the package."""
-
-KEY = "predmapnet"
 FORMAT = 1
 _SHOWN_NAMES = 4
 
@@ -84,7 +79,7 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     Raises:
         UserError: the file is missing, damaged, from something else, or its weights do not fit its configuration.
     """
-    path = _existing(path)
+    path = existing_weights(path)
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get(KEY, "{}"))
@@ -101,34 +96,6 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
     network.eval()
     return Checkpoint(network, about["facts"], about["version"], weights_hash(path))
-
-
-def weights_hash(path: Path | None = None) -> str:
-    """Return the SHA-256 of a weights file in hex; None for the shipped weights.
-
-    Raises:
-        UserError: there is no such file.
-    """
-    path = _existing(path)
-    stamp = path.stat()
-    return _hash(path, stamp.st_mtime_ns, stamp.st_size)
-
-
-@cache
-def _hash(path: Path, modified: int, size: int) -> str:
-    return sha256(path.read_bytes()).hexdigest()
-
-
-def _existing(path: Path | None) -> Path:
-    if path is None and not SHIPPED.is_file():
-        raise UserError(
-            "This installation has no lite.safetensors beside its code. "
-            "Install it again, or name a weights file (--weights FILE)."
-        )
-    path = SHIPPED if path is None else Path(path)
-    if not path.is_file():
-        raise UserError(f"There is no weights file {path}.")
-    return path
 
 
 def _full(tensor: torch.Tensor) -> torch.Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -11,10 +11,9 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
+from predmapnet.config import parse_config
 from predmapnet.errors import UserError
-
-KEY = "predmapnet"
-"""Of the metadata that PredMapNet writes."""
+from predmapnet.weights.files import KEY, existing_weights, weights_hash
 
 
 @dataclass(frozen=True)
@@ -47,12 +46,29 @@ class WeightsInfo:
         about: what PredMapNet wrote beside the tensors: format, version, configuration and facts; empty for a file
             of another program.
         tensors: in the order of the file.
+        sha256: of the file.
     """
 
     path: Path
     size: int
     about: Mapping[str, Any]
     tensors: tuple[TensorInfo, ...]
+    sha256: str
+
+    @property
+    def modules(self) -> tuple[str, ...] | None:
+        """The modules of the paper that are switched on; None for a configuration that this version cannot read."""
+        try:
+            config = parse_config(json.dumps(self.about["configuration"]), str(self.path))
+        except (UserError, KeyError):
+            return None
+        switches = {
+            "semantic-aware query generator": config.semantic_queries.enabled,
+            "history rasterized map memory": config.history_map.memory,
+            "history-map guidance": config.history_map.guidance,
+            "short-term future guidance": config.future.enabled,
+        }
+        return tuple(name for name, on in switches.items() if on)
 
     def parts(self) -> dict[str, int]:
         """Return how many numbers each part of the network has, in the order of the file."""
@@ -63,14 +79,21 @@ class WeightsInfo:
         return counts
 
 
-def inspect_file(path: Path) -> WeightsInfo:
+def parts_of(names: Iterable[str]) -> list[str]:
+    """Return the parts of the network that tensors belong to, each once, in their order."""
+    return list(dict.fromkeys(name.split(".")[0] for name in names))
+
+
+def inspect_file(path: Path | None = None) -> WeightsInfo:
     """Look into a safetensors file.
+
+    Args:
+        path: of the file; None for the weights that come with the package.
 
     Raises:
         UserError: there is no such file, or it is no whole safetensors file.
     """
-    if not path.is_file():
-        raise UserError(f"There is no weights file {path}.")
+    path = existing_weights(path)
     try:
         with safe_open(path, framework="numpy") as file:
             about = json.loads((file.metadata() or {}).get(KEY, "{}"))
@@ -83,4 +106,4 @@ def inspect_file(path: Path) -> WeightsInfo:
         raise UserError(
             f"{path} is not a whole safetensors file ({error}).{hint if path.suffix in {'.pth', '.pt'} else ''}"
         ) from None
-    return WeightsInfo(path, path.stat().st_size, about, tensors)
+    return WeightsInfo(path, path.stat().st_size, about, tensors, weights_hash(path))

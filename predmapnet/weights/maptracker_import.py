@@ -5,18 +5,26 @@ from __future__ import annotations
 import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from predmapnet.config import BevFormerConfig, PredMapNetConfig, preset
+from predmapnet.config import PRESETS, BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig, preset
+from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.weights.maptracker_names import name_here, original_of_alias
 
 BEGINNINGS = (b"PK", b"\x80\x02", b"\x80\x04", b"\x80\x05")
 """Of files that torch or pickle have written."""
+
+BASELINES = {
+    len(NUSCENES_CAMERAS): preset("maptracker-nuscenes"),
+    len(ARGOVERSE2_CAMERAS): preset("maptracker-av2"),
+}
+"""MapTracker as released, by its number of cameras."""
 
 CAMERA_CODE = "bev_encoder.camera_code"
 _SHOWN_NAMES = 4
@@ -30,11 +38,13 @@ class ImportReport:
         mapped: official name to name here.
         ignored: official name to the reason.
         missing: names here that the file does not fill, and which can do without.
+        fresh: names of the paper's modules, which MapTracker does not have: initialised at random.
     """
 
     mapped: dict[str, str] = field(default_factory=dict)
     ignored: dict[str, str] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
+    fresh: list[str] = field(default_factory=list)
 
 
 def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
@@ -63,17 +73,23 @@ def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
     return {str(name).removeprefix("module."): value for name, value in state.items()}
 
 
-def import_maptracker(official: Mapping[str, Tensor]) -> tuple[PredMapNet, ImportReport]:
+def import_maptracker(
+    official: Mapping[str, Tensor], config: PredMapNetConfig | None = None, seed: int = 0
+) -> tuple[PredMapNet, ImportReport]:
     """Make a network of an official state dict.
 
     Args:
         official: names and tensors.
+        config: MapTracker's baseline, with or without the paper's modules; None for MapTracker as it is, with the
+            cameras that the file tells. The region of interest is always the file's.
+        seed: of the parameters that only the paper's modules have.
 
     Returns:
         The network in evaluation mode, and what became of each entry.
 
     Raises:
-        UserError: entries are unknown, missing or of another shape, or constants differ from what the network does.
+        UserError: entries are unknown, missing or of another shape, constants differ from what the network does, or
+            the configuration is not one of MapTracker's baseline.
     """
     report, found = ImportReport(), {}
     unknown, faults = [], []
@@ -92,7 +108,10 @@ def import_maptracker(official: Mapping[str, Tensor]) -> tuple[PredMapNet, Impor
             unknown.append(name)
     if unknown:
         faults.append(f"{len(unknown)} unknown: {_some(unknown)}")
-    network = PredMapNet(_configuration(found)).eval()
+    config = _configuration(official, found, config)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = PredMapNet(config).eval()
     faults += _differing_constants(official, network.config)
     faults += _unfit(found, network, report)
     if faults:
@@ -101,21 +120,41 @@ def import_maptracker(official: Mapping[str, Tensor]) -> tuple[PredMapNet, Impor
     return network, report
 
 
-def _configuration(found: Mapping[str, Tensor]) -> PredMapNetConfig:
-    """Return the preset that the number of cameras tells."""
-    code = found.get(CAMERA_CODE)
-    by_cameras = {
-        config.bev.cameras: config
-        for config in map(preset, ("maptracker-nuscenes", "maptracker-av2"))
-        if isinstance(config.bev, BevFormerConfig)
-    }
-    return preset("maptracker-nuscenes") if code is None else by_cameras.get(len(code), preset("maptracker-nuscenes"))
+def _configuration(
+    official: Mapping[str, Tensor], found: Mapping[str, Tensor], config: PredMapNetConfig | None
+) -> PredMapNetConfig:
+    """Return the configuration that was asked for, or the baseline's for as many cameras; with the file's region."""
+    cameras = len(found.get(CAMERA_CODE, ()))
+    if config is None:
+        config = BASELINES.get(cameras, BASELINES[len(NUSCENES_CAMERAS)])
+    if not isinstance(config.bev, BevFormerConfig) or not isinstance(config.decoder, MapTrackerDecoderConfig):
+        raise UserError(
+            f"{config.name} is not built on MapTracker's network, so its weights do not fit. "
+            f"Choose one of: {', '.join(name for name, known in PRESETS.items() if known.bev.kind == 'bevformer')}."
+        )
+    if cameras and cameras != len(config.bev.cameras):
+        raise UserError(
+            f"The checkpoint knows {cameras} cameras, but {config.name} has {len(config.bev.cameras)} "
+            f"({', '.join(config.bev.cameras)})."
+        )
+    size = official.get("head.roi_size")
+    if size is None or size.shape != (2,):
+        return config
+    return config.model_copy(update={"roi_length": float(size[0]), "roi_width": float(size[1])})
+
+
+@cache
+def _names_of_baseline() -> frozenset[str]:
+    """Return the names of all that MapTracker itself has."""
+    with torch.device("meta"):
+        return frozenset(PredMapNet(BASELINES[len(NUSCENES_CAMERAS)]).state_dict())
 
 
 def _unfit(found: Mapping[str, Tensor], network: PredMapNet, report: ImportReport) -> list[str]:
-    """Compare names and shapes with the network's; counters of batches are the only ones that may be missing."""
+    """Compare names and shapes with the network's; only counters of batches and the paper's modules may be missing."""
     wanted = network.state_dict()
-    absent = [name for name in wanted if name not in found]
+    report.fresh = [name for name in wanted if name not in found and name not in _names_of_baseline()]
+    absent = [name for name in wanted if name not in found and name not in report.fresh]
     report.missing = [name for name in absent if name.endswith(".num_batches_tracked")]
     absent = [name for name in absent if name not in report.missing]
     surplus = [name for name in found if name not in wanted]

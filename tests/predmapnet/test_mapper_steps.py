@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import PredMapNetConfig, preset
 from predmapnet.datasets.source import Frame
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
@@ -24,15 +24,29 @@ SMALL = {
 }
 
 
-@pytest.fixture(scope="module")
-def mapper():
+PAPER = preset("paper-nuscenes").model_dump() | {
+    "image": {"kind": "whole", "width": 96, "height": 48},
+    "backbone": {"kind": "resnet50", "channels": 16},
+    "bev": {"kind": "bevformer", "rows": 13, "columns": 26, "width": 16, "heads": 2, "layers": 1, "hidden": 16},
+    "decoder": {"kind": "maptracker", "queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "hidden": 32},
+    "masks": {"stride": 1, "channels": 16},
+    "future": {"hidden": 32},
+    "depth": {"enabled": False},
+}
+PAPER["tracking"] |= {"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02}
+"""The whole network of the paper on MapTracker's baseline, reduced."""
+
+
+@pytest.fixture(scope="module", params=[pytest.param(SMALL, id="lite"), pytest.param(PAPER, id="paper")])
+def mapper(request):
     torch.manual_seed(0)
-    network = PredMapNet(PredMapNetConfig.model_validate(SMALL))
+    network = PredMapNet(PredMapNetConfig.model_validate(request.param))
     for parameter in network.parameters():
         if parameter.abs().max() == 0:
             torch.nn.init.normal_(parameter, std=0.1)
-    for layer in network.map_decoder.layers:
-        torch.nn.init.normal_(layer.classify.weight, std=0.2)
+    for name, parameter in network.map_decoder.named_parameters():
+        if "classify" in name and parameter.ndim == 2:
+            torch.nn.init.normal_(parameter, std=0.2)
     return Mapper(network)
 
 
@@ -101,7 +115,9 @@ def test_a_frame_map_holds_what_it_promises(mapper, logs):
             assert len(forecast) == (6 if ours else 0)
             if kind == 0:
                 np.testing.assert_array_equal(line[0], line[-1])
-        assert frame_map.segmentation.shape == (3, 52, 104) and frame_map.segmentation.dtype == np.float32
+        rows, columns = mapper.config.bev.rows, mapper.config.bev.columns
+        assert frame_map.segmentation.shape == (3, 2 * rows, 2 * columns)
+        assert frame_map.segmentation.dtype == np.float32
         assert frame_map.history_masks.shape == (len(frame_map), 13, 26)
 
 
@@ -127,6 +143,15 @@ def test_a_camera_that_may_be_missing_is_masked(mapper, logs):
     assert np.abs(seen.segmentation - masked.segmentation).max() > 1e-4
     with pytest.raises(UserError, match="no image of any camera"):
         mapper.read_images(replace(frame, images={}), allow_missing_cameras=True)
+
+
+@pytest.mark.parametrize("mapper", [pytest.param(PAPER, id="paper")], indirect=True)
+def test_a_network_that_knows_its_cameras_by_name_takes_them_in_any_order(mapper, logs):
+    frames = [replace(frame, rig=frame.rig[4:] + frame.rig[:4]) for frame in logs["a"][:2]]
+    for ours, expected in zip(run(mapper, frames), run(mapper, logs["a"]), strict=False):
+        same(ours, expected)
+    with pytest.raises(UserError, match="this car lacks CAM_BACK_RIGHT"):
+        mapper.step(replace(frames[0], rig=DEMO_RIG[:5]))
 
 
 def test_an_image_of_another_size_is_refused(mapper, logs, tmp_path):

@@ -15,7 +15,8 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.cache import cache_demo_scene
 from predmapnet.training.frames import CachedScene, read_scene
 from predmapnet.training.validation import map_frames, validate
-from predmapnet.weights.checkpoint import SHIPPED, load_checkpoint
+from predmapnet.weights.checkpoint import load_checkpoint
+from predmapnet.weights.files import SHIPPED
 
 MEGABYTE = 1e6
 

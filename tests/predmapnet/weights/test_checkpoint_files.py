@@ -10,7 +10,8 @@ from safetensors.torch import load_file, save_file
 from predmapnet.config import preset
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint, weights_hash
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
+from predmapnet.weights.files import weights_hash
 
 
 @pytest.fixture(scope="module")

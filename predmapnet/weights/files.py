@@ -1,0 +1,48 @@
+"""Weights files as files: where they lie, and how they are told apart."""
+
+from __future__ import annotations
+
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+from predmapnet.errors import UserError
+
+SHIPPED = Path(__file__).with_name("lite.safetensors")
+"""The weights that come with the package."""
+
+KEY = "predmapnet"
+"""Of the metadata that PredMapNet writes into a safetensors file."""
+
+
+def existing_weights(path: Path | None = None) -> Path:
+    """Return the weights file to use; None means the shipped weights.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    if path is None and not SHIPPED.is_file():
+        raise UserError(
+            "This installation has no lite.safetensors beside its code. "
+            "Install it again, or name a weights file (--weights FILE)."
+        )
+    path = SHIPPED if path is None else Path(path)
+    if not path.is_file():
+        raise UserError(f"There is no weights file {path}.")
+    return path
+
+
+def weights_hash(path: Path | None = None) -> str:
+    """Return the SHA-256 of a weights file in hex; None for the shipped weights.
+
+    Raises:
+        UserError: there is no such file.
+    """
+    path = existing_weights(path)
+    stamp = path.stat()
+    return _hash(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@cache
+def _hash(path: Path, modified: int, size: int) -> str:
+    return sha256(path.read_bytes()).hexdigest()
