@@ -112,10 +112,10 @@ def report_lines(report: SceneReport) -> list[str]:
     return lines
 
 
-def say_note(pipeline: MappingPipeline) -> None:
-    """Warn where real photographs meet weights that never saw any."""
-    if pipeline.note and not pipeline.source.synthetic:
-        say_warning(pipeline.note)
+def warn_of_weights(pipeline: MappingPipeline) -> None:
+    """Warn of weights that cannot show how well the network maps."""
+    if pipeline.warning:
+        say_warning(pipeline.warning)
 
 
 def say_report(report: SceneReport) -> None:

@@ -23,7 +23,7 @@ def infer(
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
     """Turn one driving scene into a global vector map."""
-    from cli.console import err, progress_display, say_note, say_report
+    from cli.console import err, progress_display, say_report, warn_of_weights
     from predmapnet.outputs import Outputs
     from predmapnet.threads import use_threads
 
@@ -34,7 +34,7 @@ def infer(
 
     pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras)
     err.print(pipeline.sentence, markup=False)
-    say_note(pipeline)
+    warn_of_weights(pipeline)
     with progress_display() as display:
         report = pipeline.run(scene, outputs, display.preparing, display.frames)
     say_report(report)

@@ -28,7 +28,7 @@ def view(
 
     Without a display, a scene or map is written to a recording, and the command says how to look at it.
     """
-    from cli.console import err, progress_display, say_note, say_report
+    from cli.console import err, progress_display, say_report, warn_of_weights
     from cli.viewer import Viewer
     from predmapnet.outputs import Outputs
     from predmapnet.threads import use_threads
@@ -48,7 +48,7 @@ def view(
 
         pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras)
         err.print(pipeline.sentence, markup=False)
-        say_note(pipeline)
+        warn_of_weights(pipeline)
         with progress_display() as display:
             report = pipeline.run(what, Outputs(), display.preparing, display.frames, viewer.recording)
         say_report(report)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -56,7 +57,7 @@ class Mapper:
     Attributes:
         config: of the network.
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
-        trained_on: name of the data set that the weights were trained on, if the file tells.
+        facts: what the weights file tells of its training (:class:`predmapnet.weights.checkpoint.Checkpoint`).
     """
 
     def __init__(
@@ -64,12 +65,12 @@ class Mapper:
         network: PredMapNet,
         device: str | torch.device = "cpu",
         weights_sha256: str = "",
-        trained_on: str | None = None,
+        facts: Mapping[str, Any] | None = None,
     ) -> None:
         self.network = network.to(device).eval()
         self.config: PredMapNetConfig = network.config
         self.weights_sha256 = weights_sha256
-        self.trained_on = trained_on
+        self.facts: Mapping[str, Any] = dict(facts or {})
         self._device = torch.device(device)
         self._lookups: list[tuple[Rig, RigGeometry]] = []
 
@@ -85,7 +86,7 @@ class Mapper:
             UserError: the weights or the device are not there.
         """
         checkpoint = load_checkpoint(path)
-        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts.get("data"))
+        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts)
 
     @property
     def roi(self) -> RegionOfInterest:

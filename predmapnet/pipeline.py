@@ -46,6 +46,12 @@ REAL_NOTE = (
 )
 
 
+UNTRAINED_NOTE = (
+    "Parts of this network have not been trained yet ({parts}): until they are, its maps show that everything runs, "
+    "and nothing else."
+)
+
+
 @dataclass(frozen=True)
 class Accuracy:
     """How a run compares with the ground truth.
@@ -195,9 +201,17 @@ class MappingPipeline:
     @property
     def note(self) -> str:
         """What a reader of the map has to know about where it comes from; empty if nothing."""
-        if self.source.synthetic:
-            return SYNTHETIC_NOTE
-        return REAL_NOTE if self.mapper.trained_on == DemoSource.name else ""
+        return " ".join([SYNTHETIC_NOTE, self.warning] if self.source.synthetic else [self.warning]).strip()
+
+    @property
+    def warning(self) -> str:
+        """What the user of the command has to know about the weights; empty if nothing."""
+        warnings = []
+        if not self.source.synthetic and self.mapper.facts.get("data") == DemoSource.name:
+            warnings.append(REAL_NOTE)
+        if untrained := self.mapper.facts.get("untrained"):
+            warnings.append(UNTRAINED_NOTE.format(parts=", ".join(untrained)))
+        return " ".join(warnings)
 
 
 class _ProgressObserver:

@@ -4,6 +4,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from predmapnet.weights.files import weights_hash
 from tests.predmapnet.network.maptracker_reference import FOLDER, load_reference
 
 
@@ -24,6 +25,17 @@ def test_a_public_checkpoint_becomes_weights(predmapnet, tmp_path):
     listed = predmapnet("weights", "inspect", out, "--names")
     assert "bev_encoder.camera_code" in listed.out
     assert "6 x 256" in listed.out
+    assert "modules of the paper: none" in shown.out
+
+    result = predmapnet("weights", "import", source, "--out", out, "--preset", "paper-nuscenes")
+    assert result.code == 0, result.err
+    assert "tensors begin at random and have to be trained: query_generator, mask_head" in result.out
+    shown = predmapnet("weights", "inspect", out)
+    assert "paper-nuscenes" in shown.out and "short-term future guidance" in shown.out
+    assert "untrained: query_generator, mask_head" in shown.out
+
+    result = predmapnet("weights", "import", source, "--out", out, "--preset", "paper")
+    assert (result.code, "there is no preset 'paper'" in result.err) == (2, True)
 
 
 def test_mistakes_are_explained(predmapnet, tmp_path):
@@ -37,6 +49,14 @@ def test_mistakes_are_explained(predmapnet, tmp_path):
     assert not (tmp_path / "w.safetensors").exists()
     pickled = predmapnet("weights", "inspect", tmp_path / "other.pth")
     assert (pickled.code, "has to be imported first" in pickled.err) == (2, True)
+
+
+def test_the_shipped_weights_are_shown_without_a_name(predmapnet):
+    shown = predmapnet("weights", "inspect")
+    assert shown.code == 0
+    assert "lite, written by predmapnet" in shown.out
+    assert "history-map guidance" in shown.out and "data: demo" in shown.out
+    assert f"sha256: {weights_hash()}" in shown.out
 
 
 def test_weights_of_other_programs_are_shown_as_such(predmapnet, tmp_path):

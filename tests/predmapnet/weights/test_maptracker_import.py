@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from mapfusion.elements import RegionOfInterest
 from predmapnet.config import preset
 from predmapnet.errors import UserError
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
-from predmapnet.weights.inspection import inspect_file
+from predmapnet.weights.inspection import inspect_file, parts_of
 from predmapnet.weights.maptracker_import import (
     import_maptracker,
     read_official_checkpoint,
@@ -74,7 +75,51 @@ def test_old_names_and_parallel_training_and_absent_counters(changed):
 def test_seven_cameras_are_argoverse(changed):
     changed["backbone.transformer.cams_embeds"] = torch.zeros(7, 256)
     network, _ = import_maptracker(changed)
-    assert network.config == preset("maptracker-av2") and network.config.bev.cameras == 7
+    assert network.config == preset("maptracker-av2") and len(network.config.bev.cameras) == 7
+
+
+@pytest.mark.reference
+def test_the_region_is_the_one_of_the_file(changed):
+    changed["head.roi_size"], changed["head.origin"] = torch.tensor([100.0, 50.0]), torch.tensor([-50.0, -25.0])
+    with pytest.raises(UserError, match="plane is not what a region of 100 m x 50 m needs"):
+        import_maptracker(changed)
+    changed["plane"] = changed["plane"] * torch.tensor([100 / 60, 50 / 30, 1.0, 1.0], dtype=torch.float64)
+    network, _ = import_maptracker(changed)
+    assert network.config.roi == RegionOfInterest(100.0, 50.0)
+
+
+@pytest.mark.reference
+def test_weights_under_the_modules_of_the_paper(official, tmp_path):
+    network, report = import_maptracker(official, preset("paper-nuscenes"), seed=3)
+    state = network.state_dict()
+    assert network.config == preset("paper-nuscenes") and not network.training
+    for name, here in report.mapped.items():
+        assert torch.equal(official[name], state[here])
+    assert sorted([*report.mapped.values(), *report.fresh]) == sorted(state)
+    modules = {"query_generator", "mask_head", "history_guidance", "future_guidance", "bev_pyramid", "depth_head"}
+    assert set(parts_of(report.fresh)) == modules
+    assert not {"query_generator.content", "query_generator.first_guess.0.weight"} & set(report.fresh)
+    # What guides the tracks begins as nothing, so that they start as MapTracker's.
+    for name in ("future_guidance.fusion", "history_guidance.cross_attention.output"):
+        assert not state[f"{name}.weight"].any() and not state[f"{name}.bias"].any()
+    path = tmp_path / "paper.safetensors"
+    save_checkpoint(path, network)
+    again, _ = import_maptracker(official, preset("paper-nuscenes"), seed=3)
+    for name, tensor in load_checkpoint(path).network.state_dict().items():
+        assert torch.equal(again.state_dict()[name], tensor)
+
+
+@pytest.mark.reference
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("paper-av2", r"knows 6 cameras, but paper-av2 has 7 \(ring_front_center"),
+        ("lite", "lite is not built on MapTracker's network.* Choose one of: .*paper-nuscenes"),
+    ],
+)
+def test_a_configuration_that_cannot_take_the_weights_is_refused(official, name, says):
+    with pytest.raises(UserError, match=says):
+        import_maptracker(official, preset(name))
 
 
 @pytest.mark.reference
@@ -89,7 +134,7 @@ def test_seven_cameras_are_argoverse(changed):
         ),
         ("head.something_new", torch.zeros(3), "1 unknown: head.something_new"),
         ("head.cls_branches.3.bias", torch.zeros(3), "head.cls_branches.3.bias differs from head.cls_branches.0.bias"),
-        ("head.roi_size", torch.tensor([100.0, 50.0]), "head.roi_size is not what a region of 60 m x 30 m needs"),
+        ("head.origin", torch.tensor([-50.0, -25.0]), "head.origin is not what a region of 60 m x 30 m needs"),
     ],
 )
 def test_what_does_not_fit_is_refused(changed, name, value, says):
