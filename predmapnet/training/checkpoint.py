@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from predmapnet.errors import UserError
 
 PREFIX = "step-"
+_SHOWN_NAMES = 4
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -100,6 +101,36 @@ def read_json(path: Path) -> dict[str, Any]:
     except (OSError, orjson.JSONDecodeError) as error:
         raise UserError(f"{path} cannot be read: {error}.") from None
     return value
+
+
+def start_from(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
+    """Begin a training run with the weights of a network that may have fewer modules switched on.
+
+    Args:
+        network: to be trained.
+        tensors: the state dict to begin with.
+        where: its file, for the message.
+
+    Returns:
+        Names that the file does not fill: they keep their random beginning.
+
+    Raises:
+        UserError: the file has what the network has not, or in another shape.
+    """
+    own = network.state_dict()
+    faults = [
+        name if name not in own else f"{name} {tuple(tensor.shape)} instead of {tuple(own[name].shape)}"
+        for name, tensor in tensors.items()
+        if name not in own or own[name].shape != tensor.shape
+    ]
+    if faults:
+        raise UserError(
+            f"The weights in {where} do not fit the network that is to be trained ({len(faults)} tensors: "
+            f"{', '.join(faults[:_SHOWN_NAMES])}{' ...' if len(faults) > _SHOWN_NAMES else ''}). "
+            "Choose the --preset that they were made with, or one with more modules on the same baseline."
+        )
+    network.load_state_dict(dict(tensors), strict=False)
+    return [name for name in own if name not in tensors]
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:

@@ -26,6 +26,7 @@ from predmapnet.training.validation import validate
 from predmapnet.training.workers import Workers
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 from predmapnet.weights.files import weights_hash
+from predmapnet.weights.inspection import parts_of
 
 Report = Callable[[str], None]
 
@@ -137,7 +138,9 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
     torch.manual_seed(settings.seed)
     network = PredMapNet(options.config)
     if options.initial is not None and not options.resume:
-        checkpoint.load_weights(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
+        initial = load_checkpoint(options.initial).network.state_dict()
+        if fresh := checkpoint.start_from(network, initial, options.initial):
+            report(f"Not in {options.initial.name}, so begun at random: {', '.join(parts_of(fresh))}.")
     trainer = Trainer(network, settings, options.folder, workers, report)
     if options.resume:
         trainer.resume()
