@@ -21,7 +21,7 @@ from predmapnet.config import parse_config
 from predmapnet.errors import UserError
 from predmapnet.files import write_whole
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.weights.files import KEY, existing_weights, weights_hash
+from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
 
 FORMAT = 1
 _SHOWN_NAMES = 4
@@ -85,7 +85,7 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
             about = json.loads((file.metadata() or {}).get(KEY, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is not a whole safetensors file ({error}). Fetch or write it again.") from None
+        raise unreadable(path, error) from None
     if about.get("format") != FORMAT:
         raise UserError(
             f"{path} does not hold PredMapNet weights of format {FORMAT} (it says: {about.get('format')}). "

@@ -43,6 +43,16 @@ def weights_hash(path: Path | None = None) -> str:
     return _hash(path, stamp.st_mtime_ns, stamp.st_size)
 
 
+def unreadable(path: Path, error: Exception) -> UserError:
+    """Return the error for a file that safetensors cannot read."""
+    if path.suffix in {".pth", ".pt", ".ckpt"}:
+        return UserError(
+            f"{path} is a PyTorch checkpoint, which has to be imported first: "
+            f"predmapnet weights import {path} --out weights.safetensors"
+        )
+    return UserError(f"{path} is not a whole safetensors file ({error}). Fetch or write it again.")
+
+
 @cache
 def _hash(path: Path, modified: int, size: int) -> str:
     return sha256(path.read_bytes()).hexdigest()

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 
 from predmapnet.config import parse_config
 from predmapnet.errors import UserError
-from predmapnet.weights.files import KEY, existing_weights, weights_hash
+from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,5 @@ def inspect_file(path: Path | None = None) -> WeightsInfo:
                 TensorInfo(name, tuple(part.get_shape()), part.get_dtype()) for name, part in sorted(slices.items())
             )
     except (SafetensorError, OSError, json.JSONDecodeError) as error:
-        hint = " A PyTorch checkpoint has to be imported first (predmapnet weights import)."
-        raise UserError(
-            f"{path} is not a whole safetensors file ({error}).{hint if path.suffix in {'.pth', '.pt'} else ''}"
-        ) from None
+        raise unreadable(path, error) from None
     return WeightsInfo(path, path.stat().st_size, about, tensors, weights_hash(path))
