@@ -10,10 +10,16 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+import torch
 from rerun.chunk import RrdReader
 
 from mapfusion.io import read_map
+from predmapnet.datasets.cameras import NUSCENES_CAMERAS
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.weights.checkpoint import save_checkpoint
+from predmapnet.weights.files import weights_hash
 from tests.cli.tiny_nuscenes import edit_table, image_path, write_tiny_nuscenes
+from tests.predmapnet.network.small_baseline import small_config
 
 
 @pytest.fixture
@@ -56,6 +62,29 @@ def test_a_scene_becomes_a_map_a_recording_and_a_table_of_frames(infer, tmp_path
     assert {"/world/ego_vehicle", "/world/ego_vehicle/CAM_FRONT", "/world/ego_vehicle/tracks/divider"} <= entities
     assert any(entity.startswith("/world/map/") for entity in entities)
     assert leftovers(tmp_path) == []
+
+
+def test_weights_of_maptrackers_kind_map_a_scene_too(predmapnet, tiny_root, tmp_path):
+    config = small_config("paper-nuscenes", bev={"cameras": NUSCENES_CAMERAS}, tracking={"tau_d": 0.01, "tau_t": 0.01})
+    torch.manual_seed(0)
+    save_checkpoint(tmp_path / "w.safetensors", PredMapNet(config), {"untrained": ["mask_head"], "seed": 0})
+    arguments = ("infer", "scene-0001", "--data-root", tiny_root, "--threads", 1, "--out", "map.geojson")
+    result = predmapnet(*arguments, "--weights", "w.safetensors", "--recording", "r.rrd", "--save-frames", "f.parquet")
+    assert result.code == 0, result.err
+    assert "have not been trained yet (mask_head)" in " ".join(result.err.split())
+    provenance = read_map(tmp_path / "map.geojson").provenance
+    assert provenance["configuration"] == json.loads(config.to_json())
+    assert provenance["weights_sha256"] == weights_hash(tmp_path / "w.safetensors")
+    assert "not been trained yet" in provenance["note"]
+    assert pq.read_table(tmp_path / "f.parquet").num_rows == 3
+    assert leftovers(tmp_path) == []
+
+    others = small_config("paper-nuscenes", bev={"cameras": ("front", "back")})
+    save_checkpoint(tmp_path / "others.safetensors", PredMapNet(others))
+    result = predmapnet(*arguments, "--weights", "others.safetensors")
+    assert result.code == 2
+    said = " ".join(result.err.split())
+    assert "each of 2 cameras (front, back), but this car lacks front, back and has CAM_FRONT" in said
 
 
 def test_the_same_command_twice_writes_the_same_bytes_but_for_the_time(infer, tmp_path):

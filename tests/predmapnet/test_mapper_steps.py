@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig, preset
+from predmapnet.config import PredMapNetConfig
+from predmapnet.datasets.cameras import NUSCENES_CAMERAS
 from predmapnet.datasets.source import Frame
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.mapper import Mapper
 from predmapnet.network.interface import StreamState
 from predmapnet.network.predmapnet import PredMapNet
+from tests.predmapnet.network.small_baseline import small_config
 
 SMALL = {
     "image": {"width": 64, "height": 24},
@@ -24,17 +26,11 @@ SMALL = {
 }
 
 
-PAPER = preset("paper-nuscenes").model_dump() | {
-    "image": {"kind": "whole", "width": 96, "height": 48},
-    "backbone": {"kind": "resnet50", "channels": 16},
-    "bev": {"kind": "bevformer", "rows": 13, "columns": 26, "width": 16, "heads": 2, "layers": 1, "hidden": 16},
-    "decoder": {"kind": "maptracker", "queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "hidden": 32},
-    "masks": {"stride": 1, "channels": 16},
-    "future": {"hidden": 32},
-    "depth": {"enabled": False},
-}
-PAPER["tracking"] |= {"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02}
-"""The whole network of the paper on MapTracker's baseline, reduced."""
+PAPER = small_config(
+    "paper-nuscenes",
+    bev={"rows": 13, "columns": 26, "cameras": NUSCENES_CAMERAS},
+    tracking={"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02},
+).model_dump()
 
 
 @pytest.fixture(scope="module", params=[pytest.param(SMALL, id="lite"), pytest.param(PAPER, id="paper")])
@@ -110,9 +106,9 @@ def test_a_frame_map_holds_what_it_promises(mapper, logs):
         for kind, line, forecast, ours in zip(
             frame_map.kinds, frame_map.polylines, frame_map.forecasts, tracked, strict=True
         ):
-            assert line.shape == (6, 2) and line.dtype == np.float64
+            assert line.shape == (mapper.config.decoder.points, 2) and line.dtype == np.float64
             assert (np.abs(line) <= frame_map.roi.size / 2).all()
-            assert len(forecast) == (6 if ours else 0)
+            assert len(forecast) == (mapper.config.decoder.points if ours else 0)
             if kind == 0:
                 np.testing.assert_array_equal(line[0], line[-1])
         rows, columns = mapper.config.bev.rows, mapper.config.bev.columns

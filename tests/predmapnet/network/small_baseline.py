@@ -14,7 +14,7 @@ SIZE = (64, 96)
 SECTIONS = {
     "image": {"height": SIZE[0], "width": SIZE[1]},
     "backbone": {"channels": 32},
-    "bev": {"rows": 10, "columns": 20, "width": 32, "heads": 4, "hidden": 32, "cameras": 2},
+    "bev": {"rows": 10, "columns": 20, "width": 32, "heads": 4, "hidden": 32, "cameras": ("front", "back")},
     "temporal_bev": {"capacity": 6},
     "masks": {"channels": 16},
     "future": {"hidden": 32},

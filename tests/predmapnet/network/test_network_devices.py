@@ -40,7 +40,7 @@ def tracks_of(outputs, batch):
 @pytest.mark.parametrize("preset", ["maptracker-nuscenes", "paper-nuscenes"])
 def test_the_frames_of_a_training_clip_stay_on_the_gpu(preset):
     config = small_config(preset)
-    batch, cameras = 2, config.bev.cameras
+    batch, cameras = 2, len(config.bev.cameras)
     pillars = small_pillars(config)
     assert len(pillars.camera)
     network = PredMapNet(config).train()
