@@ -18,6 +18,7 @@ from predmapnet.datasets.images import read_image
 from predmapnet.datasets.source import Float, Frame, Image, Rig
 from predmapnet.errors import UserError
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
+from predmapnet.network.inference import for_inference
 from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.rig_geometry import arranged_rig
@@ -67,7 +68,7 @@ class Mapper:
         weights_sha256: str = "",
         facts: Mapping[str, Any] | None = None,
     ) -> None:
-        self.network = network.to(device).eval()
+        self.network = for_inference(network).to(device)
         self.config: PredMapNetConfig = network.config
         self.weights_sha256 = weights_sha256
         self.facts: Mapping[str, Any] = dict(facts or {})

@@ -20,6 +20,7 @@ class DeformableConvolution(nn.Module):
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.empty(channels_out, channels_in, 3, 3))
+        self.register_parameter("bias", None)
         self.offsets = nn.Conv2d(channels_in, 3 * TAPS, 3, padding=1)
         nn.init.kaiming_uniform_(self.weight, nonlinearity="relu")
         nn.init.zeros_(self.offsets.weight)
@@ -38,7 +39,7 @@ class DeformableConvolution(nn.Module):
         pixels = features.permute(0, 2, 3, 1).reshape(-1, channels)
         samples = weighted_rows(pixels, indices, shares.view(-1, 4)).view(-1, TAPS * channels)
         kernel = self.weight.permute(0, 2, 3, 1).reshape(-1, TAPS * channels)
-        return linear(samples, kernel).view(batch, height, width, -1).permute(0, 3, 1, 2)
+        return linear(samples, kernel, self.bias).view(batch, height, width, -1).permute(0, 3, 1, 2)
 
     @staticmethod
     def _positions(moves: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:

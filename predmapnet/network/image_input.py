@@ -6,6 +6,7 @@ kind of the configuration: the window below the sky, or the whole image as MapTr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -104,11 +105,25 @@ def crop_image(image: Image, camera: Camera, config: ImageConfig) -> Window:
         # No averaging: released weights have learned from images as coarse as this interpolation leaves them.
         stretched = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(stretched, dtype=np.float32)
-    scaled = image if size == image.shape[1::-1] else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    cropped = scaled[window.top : window.top + config.height]
+    cropped = _scaled_rows(image, window, window.top, window.top + config.height)
     missing = config.height - len(cropped)
     whole = np.pad(cropped, ((0, missing), (0, 0), (0, 0))) if missing else np.ascontiguousarray(cropped)
     return np.asarray(whole, dtype=np.uint8)
+
+
+def _scaled_rows(image: Image, window: ImageWindow, first: int, last: int) -> NDArray[np.uint8]:
+    """Return rows ``first`` to ``last`` of the scaled image, as many as there are; the others are not computed.
+
+    Scaling turns blocks of whole rows into blocks of whole rows, so that it may begin at any of them.
+    """
+    if (window.scaled_height, window.scaled_width) == image.shape[:2]:
+        return np.asarray(image[first:last], dtype=np.uint8)
+    blocks = math.gcd(len(image), window.scaled_height)
+    rows_in, rows_out = len(image) // blocks, window.scaled_height // blocks
+    begin, end = first // rows_out, min(-(-last // rows_out), blocks)
+    part, size = image[begin * rows_in : end * rows_in], (window.scaled_width, (end - begin) * rows_out)
+    scaled = cv2.resize(part, size, interpolation=cv2.INTER_AREA)[first - begin * rows_out :]
+    return np.asarray(scaled[: last - first], dtype=np.uint8)
 
 
 def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:

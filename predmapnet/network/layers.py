@@ -24,10 +24,10 @@ class Attention(nn.Module):
     def __init__(self, width: int, heads: int, key_width: int | None = None) -> None:
         super().__init__()
         self.heads = heads
-        self.query = nn.Linear(width, width)
-        self.key = nn.Linear(key_width or width, width)
-        self.value = nn.Linear(key_width or width, width)
-        self.output = nn.Linear(width, width)
+        self.query = Linear(width, width)
+        self.key = Linear(key_width or width, width)
+        self.value = Linear(key_width or width, width)
+        self.output = Linear(width, width)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None = None) -> Tensor:
         """Attend.
@@ -56,7 +56,7 @@ class Perceptron(nn.Sequential):
     def __init__(self, *widths: int, zero_last: bool = False) -> None:
         layers: list[nn.Module] = []
         for width_in, width_out in pairwise(widths):
-            layers += [nn.Linear(width_in, width_out), nn.ReLU()]
+            layers += [Linear(width_in, width_out), nn.ReLU()]
         super().__init__(*layers[:-1])
         if zero_last:
             zero_init(self[-1])
@@ -124,7 +124,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(B, C_in, h, w)`` to ``(B, C_out, h / stride, w / stride)``."""
-        return F.relu(self.second(self.first(features)) + self.shortcut(features))
+        return F.relu(self.second(self.first(features)) + self.shortcut(features), inplace=True)
 
 
 def zero_init(layer: nn.Module) -> None:

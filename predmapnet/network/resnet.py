@@ -24,7 +24,7 @@ class DeformableUnit(nn.Module):
     def __init__(self, width: int) -> None:
         super().__init__()
         self.convolution = DeformableConvolution(width, width)
-        self.norm = nn.BatchNorm2d(width)
+        self.norm: nn.Module = nn.BatchNorm2d(width)
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``(N, C, h, w)`` to ``(N, C, h, w)``."""

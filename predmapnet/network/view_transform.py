@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.datasets.source import Camera, Float, Rig
+from predmapnet.datasets.source import Float, Rig
 from predmapnet.network.image_backbone import STRIDE
 from predmapnet.network.image_input import input_size, window_intrinsics
 from predmapnet.network.layers import cell_centres
@@ -34,12 +35,13 @@ class SparseRows:
     starts: Tensor
     weights: Tensor
 
-    @classmethod
-    def from_entries(cls, rows: Tensor, columns: Tensor, weights: Tensor, row_count: int) -> SparseRows:
-        """Sort entries by row."""
-        order = torch.argsort(rows, stable=True)
-        counts = torch.bincount(rows, minlength=row_count)
-        return cls(columns[order].contiguous(), torch.cumsum(counts, 0) - counts, weights[order].contiguous())
+    def transposed(self, columns: int) -> SparseRows:
+        """Return the transpose of a matrix with that many columns."""
+        counts = torch.diff(self.starts, append=self.starts.new_tensor([len(self.columns)]))
+        rows = torch.arange(len(self.starts), device=counts.device).repeat_interleave(counts)
+        order = torch.argsort(self.columns, stable=True)
+        counts = torch.bincount(self.columns, minlength=columns)
+        return SparseRows(rows[order], torch.cumsum(counts, 0) - counts, self.weights[order])
 
     def multiply(self, table: Tensor) -> Tensor:
         """Multiply with ``(columns, C)``; an embedding bag is several times faster than a CSR product on a CPU."""
@@ -56,23 +58,26 @@ class RigLookup:
 
     Attributes:
         gather: ground cells x feature pixels of all cameras: bilinear weights, summed over cameras.
-        scatter: the transpose, for the backward pass.
+        pixels: of the features of all cameras, as many as ``gather`` has columns.
         visible: ``(cells, N) float32``, 1 where a camera sees the centre of a cell.
         grid: rows and columns of ground cells.
         feature_size: rows and columns of the image features.
     """
 
     gather: SparseRows
-    scatter: SparseRows
+    pixels: int
     visible: Tensor
     grid: tuple[int, int]
     feature_size: tuple[int, int]
 
+    @cached_property
+    def scatter(self) -> SparseRows:
+        """The transpose of ``gather``, for the backward pass."""
+        return self.gather.transposed(self.pixels)
+
     def to(self, device: torch.device | str) -> RigLookup:
         """Return a copy on ``device``."""
-        return replace(
-            self, gather=self.gather.to(device), scatter=self.scatter.to(device), visible=self.visible.to(device)
-        )
+        return replace(self, gather=self.gather.to(device), visible=self.visible.to(device))
 
 
 def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
@@ -83,64 +88,63 @@ def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
         config: image and grid sizes.
     """
     grid = (2 * config.bev.rows, 2 * config.bev.columns)
-    rows, columns = (-(-size // STRIDE) for size in input_size(config.image))
-    roi = config.roi
-    ground = (cell_centres(*grid).double().numpy().reshape(-1, 2) - 0.5) * roi.size
-    entries: list[tuple[Integer, Integer, Float]] = []
-    visible = np.zeros((len(ground), len(rig)), dtype=np.float32)
-    for number, camera in enumerate(rig):
-        pixels, seen = _project(ground, camera, config)
-        visible[seen, number] = 1.0
-        cells = np.flatnonzero(seen)
-        for corner, share in _bilinear(pixels[cells] / STRIDE - 0.5, rows, columns):
-            entries.append((cells, corner + number * rows * columns, share))
-    cell, pixel, weight = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*entries, strict=True))
-    weight = weight.float()
+    size = -(-np.array(input_size(config.image)) // STRIDE)
+    ground = (cell_centres(*grid).double().numpy().reshape(-1, 2) - 0.5) * config.roi.size
+    pixels, seen = _project(ground, rig, config)
+    cell, camera = np.nonzero(seen)  # cell after cell, so that the entries of each row follow one another
+    corners, shares = _bilinear(pixels[cell, camera] / STRIDE - 0.5, *size)
+    corners += camera[:, None] * size.prod()
+    entries = 4 * seen.sum(axis=1)
     return RigLookup(
-        gather=SparseRows.from_entries(cell, pixel, weight, len(ground)),
-        scatter=SparseRows.from_entries(pixel, cell, weight, len(rig) * rows * columns),
-        visible=torch.from_numpy(visible),
+        gather=SparseRows(
+            columns=torch.from_numpy(corners.ravel()),
+            starts=torch.from_numpy(entries.cumsum() - entries),
+            weights=torch.from_numpy(shares.ravel().astype(np.float32)),
+        ),
+        pixels=len(rig) * int(size.prod()),
+        visible=torch.from_numpy(seen.astype(np.float32)),
         grid=grid,
-        feature_size=(rows, columns),
+        feature_size=(int(size[0]), int(size[1])),
     )
 
 
-def _project(ground: Float, camera: Camera, config: PredMapNetConfig) -> tuple[Float, NDArray[np.bool_]]:
-    """Return pixels ``(n, 2)`` in the network's window, and whether each point is inside it."""
-    rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
-    points = (np.column_stack([ground, np.full(len(ground), camera.ground_height)]) - position) @ rotation
-    depth = points[:, 2]
-    projected = points @ window_intrinsics(camera, config.image).T
-    pixels = projected[:, :2] / np.maximum(depth, 1e-3)[:, None]
-    size = np.array([config.image.width, config.image.height])
-    return pixels, (depth > 0.1) & (pixels >= 0).all(axis=1) & (pixels < size).all(axis=1)
+def _project(ground: Float, rig: Rig, config: PredMapNetConfig) -> tuple[Float, NDArray[np.bool_]]:
+    """Return pixels ``(n, N, 2)`` in the network's window of each camera, and whether each point is inside it."""
+    # On a plane, a projection is a matrix that multiplies (x, y, 1).
+    planes = []
+    for camera in rig:
+        rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
+        to_camera = np.column_stack([rotation.T[:, :2], rotation.T @ ([0.0, 0.0, camera.ground_height] - position)])
+        planes.append(window_intrinsics(camera, config.image) @ to_camera)
+    projected = (np.column_stack([ground, np.ones(len(ground))]) @ np.concatenate(planes).T).reshape(len(ground), -1, 3)
+    depth = projected[..., 2]
+    pixels = projected[..., :2] / np.maximum(depth, 1e-3)[..., None]
+    inside = (pixels >= 0) & (pixels < [config.image.width, config.image.height])
+    return pixels, (depth > 0.1) & inside[..., 0] & inside[..., 1]
 
 
-def _bilinear(pixels: Float, rows: int, columns: int) -> list[tuple[Integer, Float]]:
-    """Return the four neighbours of each position (flat index, clamped at the border) and their weights."""
+def _bilinear(pixels: Float, rows: int, columns: int) -> tuple[Integer, Float]:
+    """Return the four neighbours ``(n, 4)`` of each position (flat index, clamped at the border) and their weights."""
     base = np.floor(pixels)
-    fraction = pixels - base
-    corners = []
-    for right in (0, 1):
-        for down in (0, 1):
-            x = np.clip(base[:, 0] + right, 0, columns - 1).astype(np.int64)
-            y = np.clip(base[:, 1] + down, 0, rows - 1).astype(np.int64)
-            weight = np.abs(1 - right - fraction[:, 0]) * np.abs(1 - down - fraction[:, 1])
-            corners.append((y * columns + x, weight))
-    return corners
+    right, down = (pixels - base).T
+    left_x, top_y = base.T
+    x = np.clip([left_x, left_x, left_x + 1, left_x + 1], 0, columns - 1)
+    y = np.clip([top_y, top_y + 1, top_y, top_y + 1], 0, rows - 1)
+    weights = [(1 - right) * (1 - down), (1 - right) * down, right * (1 - down), right * down]
+    return np.ascontiguousarray((y * columns + x).astype(np.int64).T), np.ascontiguousarray(np.transpose(weights))
 
 
 class _SparseProduct(torch.autograd.Function):
-    """Multiply each stream's features with the sparse matrix; the stored transpose serves the backward pass."""
+    """Multiply each stream's features with the sparse matrix; the transpose serves the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, features: Tensor, lookup: RigLookup) -> Tensor:
-        ctx.scatter = lookup.scatter
+        ctx.lookup = lookup
         return torch.stack([lookup.gather.multiply(table) for table in features])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return torch.stack([ctx.scatter.multiply(table) for table in gradient.contiguous()]), None
+        return torch.stack([ctx.lookup.scatter.multiply(table) for table in gradient.contiguous()]), None
 
 
 def to_ground(features: Tensor, camera_valid: Tensor, lookup: RigLookup) -> Tensor:
