@@ -194,13 +194,13 @@ def _same_rig(first: Rig, second: Rig) -> bool:
     def looks(rig: Rig) -> list[tuple[str, int, int, float]]:
         return [(camera.name, camera.width, camera.height, camera.ground_height) for camera in rig]
 
-    def close(one: Float, other: Float) -> bool:
-        return np.allclose(one, other, rtol=RIG_TOLERANCE, atol=RIG_TOLERANCE)
+    def numbers(rig: Rig) -> Float:
+        return np.concatenate([part.ravel() for camera in rig for part in (camera.intrinsics, camera.camera_to_ego)])
 
-    return looks(first) == looks(second) and all(
-        close(one.intrinsics, other.intrinsics) and close(one.camera_to_ego, other.camera_to_ego)
-        for one, other in zip(first, second, strict=True)
-    )
+    if looks(first) != looks(second):
+        return False
+    one, other = numbers(first), numbers(second)
+    return bool((np.abs(one - other) <= RIG_TOLERANCE * (1 + np.abs(other))).all())
 
 
 def _missing_camera(frame: Frame, camera: str, path: Path | None) -> str:

@@ -17,6 +17,8 @@ class DeformableConvolution(nn.Module):
     It starts as an ordinary convolution with all taps counting half.
     """
 
+    bias: nn.Parameter | None
+
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.empty(channels_out, channels_in, 3, 3))

@@ -56,7 +56,7 @@ class Perceptron(nn.Sequential):
     def __init__(self, *widths: int, zero_last: bool = False) -> None:
         layers: list[nn.Module] = []
         for width_in, width_out in pairwise(widths):
-            layers += [Linear(width_in, width_out), nn.ReLU()]
+            layers += [nn.Linear(width_in, width_out), nn.ReLU()]
         super().__init__(*layers[:-1])
         if zero_last:
             zero_init(self[-1])
