@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -308,8 +308,9 @@ class MapTrackerQuirks(Section):
     single_precision_memory_poses: bool = False
 
 
-QUIRKS_OF_ENCODER = ("mirrored_self_attention", "propagate_where_sum_is_positive", "endpoint_warp_grid")
-QUIRKS_OF_DECODER = ("norm_before_cross_attention", "single_precision_memory_poses")
+QUIRKS_OF_ENCODER = {"mirrored_self_attention", "propagate_where_sum_is_positive", "endpoint_warp_grid"}
+QUIRKS_OF_DECODER = {"norm_before_cross_attention", "single_precision_memory_poses"}
+QUIRKS_OF_BOTH = {"tracks_moved_from_chosen_history"}
 ALL_QUIRKS = MapTrackerQuirks(**dict.fromkeys(MapTrackerQuirks.model_fields, True))
 
 
@@ -406,32 +407,9 @@ class PredMapNetConfig(Section):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
         """Refuse parts that cannot work on each other."""
-        bevformer = isinstance(self.bev, BevFormerConfig)
-        maptracker = isinstance(self.decoder, MapTrackerDecoderConfig)
-        set_quirks = {name for name, value in self.quirks if value}
-        faults = {
-            "bev 'bevformer' reads the three levels of backbone 'resnet50', and 'lookup' the one of 'small'": bevformer
-            != isinstance(self.backbone, ResNet50Config),
-            "bev 'bevformer' needs temporal_bev 'encoder', and 'lookup' needs 'residual'": bevformer
-            != isinstance(self.temporal_bev, EncoderBevMemoryConfig),
-            "bev 'bevformer' needs backbone.channels of its own width": isinstance(self.bev, BevFormerConfig)
-            and self.backbone.channels != self.bev.width,
-            "bev 'bevformer' has masks on its own grid only: set masks.stride to 1": bevformer
-            and self.masks.stride != 1,
-            "decoder 'maptracker' lets detections see tracks: set tracking.query_assignment to 'suppress'": maptracker
-            and self.tracking.query_assignment != "suppress",
-            "quirk tracks_moved_from_chosen_history needs bev 'bevformer' and decoder 'maptracker'": not (
-                bevformer and maptracker
-            )
-            and self.quirks.tracks_moved_from_chosen_history,
-            "these quirks belong to bev 'bevformer': " + ", ".join(QUIRKS_OF_ENCODER): not bevformer
-            and bool(set_quirks & set(QUIRKS_OF_ENCODER)),
-            "these quirks belong to decoder 'maptracker': " + ", ".join(QUIRKS_OF_DECODER): not maptracker
-            and bool(set_quirks & set(QUIRKS_OF_DECODER)),
-        }
-        said = [fault for fault, holds in faults.items() if holds]
-        if said:
-            raise ValueError("; ".join(said))
+        faults = "; ".join(_faults(self))
+        if faults:
+            raise ValueError(faults)
         return self
 
     @property
@@ -447,6 +425,30 @@ class PredMapNetConfig(Section):
     def to_json(self) -> str:
         """Return the configuration as JSON, for provenance; :func:`parse_config` reads it back."""
         return self.model_dump_json()
+
+
+def _faults(config: PredMapNetConfig) -> Iterator[str]:
+    """Name the parts that cannot work on each other."""
+    bevformer = isinstance(config.bev, BevFormerConfig)
+    maptracker = isinstance(config.decoder, MapTrackerDecoderConfig)
+    if bevformer != isinstance(config.backbone, ResNet50Config):
+        yield "bev 'bevformer' reads the three levels of backbone 'resnet50', and 'lookup' the one of 'small'"
+    if bevformer != isinstance(config.temporal_bev, EncoderBevMemoryConfig):
+        yield "bev 'bevformer' needs temporal_bev 'encoder', and 'lookup' needs 'residual'"
+    if bevformer and config.backbone.channels != config.bev.widths[0]:
+        yield "bev 'bevformer' is as wide as the image features: bev.width and backbone.channels differ"
+    if bevformer and config.masks.stride != 1:
+        yield "bev 'bevformer' has masks on its own grid only: set masks.stride to 1"
+    if maptracker and config.tracking.query_assignment != "suppress":
+        yield "decoder 'maptracker' lets detections see tracks: set tracking.query_assignment to 'suppress'"
+    on = {name for name, value in config.quirks if value}
+    for quirks, needed, present in (
+        (QUIRKS_OF_ENCODER, "bev 'bevformer'", bevformer),
+        (QUIRKS_OF_DECODER, "decoder 'maptracker'", maptracker),
+        (QUIRKS_OF_BOTH, "bev 'bevformer' and decoder 'maptracker'", bevformer and maptracker),
+    ):
+        if on & quirks and not present:
+            yield f"quirks without what they are quirks of, {needed}: {', '.join(sorted(on & quirks))}"
 
 
 def _maptracker(name: str, image: WholeImageConfig, cameras: tuple[str, ...]) -> PredMapNetConfig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -36,14 +35,3 @@ class UpsamplingSegmentationHead(nn.Module):
         """Map ``(B, C, H, W)`` to logits ``(B, classes, 2 H, 2 W)``."""
         hidden = F.interpolate(F.relu(self.before(bev)), scale_factor=2, mode="nearest")
         return self.classify(F.relu(self.after(hidden)))
-
-
-def semantic_mask(logits: Tensor, threshold: float = 0.4) -> Tensor:
-    """Return the class of each cell plus one where its probability reaches the threshold, 0 elsewhere.
-
-    Args:
-        logits: ``(B, classes, h, w)``.
-        threshold: of the probability.
-    """
-    best, kind = logits.sigmoid().max(dim=1)
-    return torch.where(best >= threshold, kind + 1, 0).to(torch.uint8)

@@ -12,7 +12,6 @@ from predmapnet.network.bev_history import BevHistory, look_back
 from predmapnet.network.camera_pillars import CameraPillars, project_pillars
 from predmapnet.network.interface import FrameInputs, FrameOutputs, Selection, StreamState
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.segmentation_head import semantic_mask
 from predmapnet.network.tracking import select
 from predmapnet.network.vector_memory import age_code, recall
 from tests.predmapnet.network.maptracker_reference import FOLDER, Reference, difference, load_reference, recorded
@@ -266,6 +265,12 @@ class Step:
             "pos.global_ids": kept.track_ids[0],
             "pos.num_instance": after.next_track_id[0],
         }
+
+
+def semantic_mask(logits: Tensor) -> Tensor:
+    """The class of each cell plus one where its probability reaches 0.4, else 0."""
+    best, kind = logits.sigmoid().max(dim=1)
+    return torch.where(best >= 0.4, kind + 1, 0)
 
 
 def slot_major(values: Tensor, slots: int) -> Tensor:

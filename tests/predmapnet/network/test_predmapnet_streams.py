@@ -5,8 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import instances_from_rows
+from tests.predmapnet.network.conftest import SMALL
 
 MODULES = {
     "history_map": {"history_map": {"guidance": False, "memory": False}},
@@ -73,6 +76,20 @@ def test_masks_exist_only_where_a_module_needs_them(sections, make_network, look
     assert (outputs.layers[-1].masks is None) == bool(sections)
     state = network.advance(None, outputs, keep_rows(outputs, 2), make_inputs())
     assert network(make_inputs(x=1.0), lookup, state).layers[-1].points.shape == (1, 10, 6, 2)
+
+
+@torch.no_grad()
+def test_the_larger_decoder_works_on_the_lighter_encoder(lookup, make_inputs):
+    decoder = {"kind": "maptracker", "queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "hidden": 32}
+    tracking = {"query_assignment": "suppress"}
+    network = PredMapNet(PredMapNetConfig.model_validate({**SMALL, "decoder": decoder, "tracking": tracking})).eval()
+    state = None
+    for number in range(3):
+        inputs = make_inputs(2, seed=number, x=2.0 * number)
+        outputs = network(inputs, lookup, state)
+        state = network.advance(state, outputs, keep_rows(outputs, 3), inputs)
+    assert all(torch.isfinite(tensor).all() for tensor in everything(outputs))
+    assert state.vector_memory.valid.sum(dim=-1).tolist() == [[3, 3, 3]] * 2
 
 
 @torch.no_grad()
