@@ -15,7 +15,7 @@ from mapfusion.cleaning import line_elements, ring_elements
 from mapfusion.config import IntegratorConfig
 from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
-from mapfusion.joining import join
+from mapfusion.joining import Ends, all_ends, ends_of, join
 from mapfusion.journal import Journal
 from mapfusion.lines import Evidence, FusedLine, beside, fuse
 from mapfusion.observations import Observation, Track, observe, pose_problem
@@ -71,8 +71,9 @@ class MapIntegrator:
         self.frames = 0
         self.errors = ErrorModel()
         self._parts = PRIOR_SHARES
-        self._clean: dict[int, list[MapElement]] = {}
+        self._clean: dict[int, tuple[list[MapElement], Ends]] = {}
         self._dirty: set[int] = set()
+        self._joined: tuple[MapElement, ...] = ()
 
     def add(self, frame_map: FrameMap, log: str = "") -> None:
         """Fuse the tracked elements of one frame.
@@ -108,23 +109,31 @@ class MapIntegrator:
         self._add_rings(rings, [i for i in near if i in self.rings], frame_map, visible)
 
     def map(self) -> GlobalMap:
-        """Return the map as it stands; only what changed since the last call is computed."""
+        """Return the map as it stands; only what changed since the last call is computed, and which lines join."""
+        if self._dirty:
+            self._refresh()
+        return GlobalMap(self._joined, {"frames": self.frames, "integrator": asdict(self.config)})
+
+    def _refresh(self) -> None:
         parts = self.errors.parts()
         if np.abs(parts - self._parts).sum() > STALE * self._parts.sum():
             self._parts = parts
             self._dirty.update(self.lines, self.rings)
         for element in self._dirty:
             if element in self.lines:
-                self._clean[element] = line_elements(self.lines[element], self.views, self._parts, self.config)
+                found = line_elements(self.lines[element], self.views, self._parts, self.config)
             elif element in self.rings:
-                self._clean[element] = ring_elements(self.rings[element], self.views, self._parts, self.config)
+                found = ring_elements(self.rings[element], self.views, self._parts, self.config)
+            else:
+                found = []
+            if found:
+                self._clean[element] = found, ends_of(found)
             else:
                 self._clean.pop(element, None)
         self._dirty.clear()
-        elements = [element for key in sorted(self._clean) for element in self._clean[key]]
-        return GlobalMap(
-            tuple(join(elements, self.views, self.config)), {"frames": self.frames, "integrator": asdict(self.config)}
-        )
+        pieces = [self._clean[key] for key in sorted(self._clean)]
+        elements = [element for found, _ in pieces for element in found]
+        self._joined = tuple(join(elements, self.views, self.config, all_ends(pieces)))
 
     def save(self, path: Path) -> None:
         """Write the state to a ``.npz`` file, to go on later with :meth:`load`; raises OSError."""

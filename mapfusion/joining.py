@@ -20,6 +20,7 @@ from mapfusion.geometry import arc_length
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
 End = tuple[int, int]
 """Which element, and 0 for its start or -1 for its end."""
 
@@ -45,35 +46,76 @@ class _Link:
     overlap: float
 
 
-def join(elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
+@dataclass(frozen=True)
+class Ends:
+    """The ends of elements, as arrays of equal length; crossings and closed lines have none.
+
+    Attributes:
+        element: ``(n,) int64``, which element.
+        end: ``(n,) int64``, 0 for its start, -1 for its end.
+        kind: ``(n,) int64``.
+        tip: ``(n, 2) float64``, metres.
+        outward: ``(n, 2) float64``, unit, the direction that leads out of it.
+    """
+
+    element: Integer
+    end: Integer
+    kind: Integer
+    tip: Float
+    outward: Float
+
+
+def ends_of(elements: Sequence[MapElement]) -> Ends:
+    """Return the ends of elements."""
+    rows = [
+        (number, end)
+        for number, element in enumerate(elements)
+        if not element.kind.is_ring and (element.points[0] != element.points[-1]).any()
+        for end in (0, -1)
+    ]
+    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return Ends(
+        table[:, 0],
+        table[:, 1],
+        np.array([elements[number].kind for number, _ in rows], dtype=np.int64),
+        np.array([elements[number].points[end] for number, end in rows]).reshape(-1, 2),
+        np.array([_direction(elements[number].points, end) for number, end in rows]).reshape(-1, 2),
+    )
+
+
+def all_ends(pieces: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
+    """Put the ends of several lists of elements together, numbered as if the lists were one."""
+    known = [ends for _, ends in pieces]
+    before = np.cumsum([0, *(len(elements) for elements, _ in pieces)])
+    counts = [len(ends.element) for ends in known]
+    nothing = ends_of([])
+    columns = (
+        np.concatenate([getattr(nothing, name), *(getattr(ends, name) for ends in known)])
+        for name in ("element", "end", "kind", "tip", "outward")
+    )
+    element, end, kind, tip, outward = columns
+    return Ends(element + np.repeat(before[:-1], counts), end, kind, tip, outward)
+
+
+def join(
+    elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig, ends: Ends | None = None
+) -> list[MapElement]:
     """Join the lines that go on in each other; crossings and closed lines stay as they are.
 
     Args:
         elements: of one map, metres.
         views: where the car has looked.
         config: how far apart, and how well in line, ends must be.
+        ends: of the elements, if they are known.
 
     Returns:
         The elements, in the order of the first piece of each.
     """
-    open_ends: list[End] = [
-        (number, end)
-        for number, element in enumerate(elements)
-        if not element.kind.is_ring and (element.points[0] != element.points[-1]).any()
-        for end in (0, -1)
-    ]
-    if len(open_ends) < 2:
+    ends = ends_of(elements) if ends is None else ends
+    if len(ends.tip) < 2:
         return list(elements)
-    tips = np.array([elements[number].points[end] for number, end in open_ends])
-    outward = np.array([_direction(elements[number].points, end) for number, end in open_ends])
-    links = []
-    for first, second in cKDTree(tips).query_pairs(config.join_gap, output_type="ndarray").tolist():
-        link = _link(elements, open_ends[first], open_ends[second], outward[first], outward[second], views, config)
-        if link is not None:
-            links.append(link)
-    if not links:
-        return list(elements)
-    return _chained(list(elements), sorted(links, key=lambda link: (link.cost, link.ends)))
+    links = _links(elements, ends, views, config)
+    return _chained(list(elements), sorted(links, key=lambda link: (link.cost, link.ends))) if links else list(elements)
 
 
 def _direction(points: Float, end: int) -> Float:
@@ -86,37 +128,31 @@ def _direction(points: Float, end: int) -> Float:
     return np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
 
 
-def _link(
-    elements: Sequence[MapElement],
-    first: End,
-    second: End,
-    out: Float,
-    other_out: Float,
-    views: ViewGrid,
-    config: IntegratorConfig,
-) -> _Link | None:
-    """Return how well two ends go on in each other, or None if they do not."""
-    one, two = elements[first[0]], elements[second[0]]
-    if one.kind is not two.kind or (first[0] == second[0] and one.length < SHORTEST_LOOP):
-        return None
-    straight = np.cos(np.radians(config.join_angle))
-    if -(out @ other_out) < straight:
-        return None
-    start, stop = one.points[first[1]], two.points[second[1]]
-    axis = out - other_out
-    axis /= np.linalg.norm(axis)
-    gap = stop - start
-    along = float(gap @ axis)
-    aside = float(np.linalg.norm(gap - along * axis))
-    if along < -config.join_overlap or aside > config.join_aside * (1.0 + max(along, 0.0) / config.join_gap):
-        return None
-    if along > config.max_gap:
-        between = start + np.linspace(0.0, 1.0, max(int(along), 2) + 1)[1:-1, None] * gap
-        if float(np.median(views.at(between))) > config.join_views:
-            return None
-    if first[0] == second[0] and along < 0.0:
-        return None
-    return _Link(abs(along) + 2.0 * aside, (first, second), max(-along, 0.0))
+def _links(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, config: IntegratorConfig) -> list[_Link]:
+    """Return the pairs of ends that go on in each other."""
+    first, second = cKDTree(ends.tip).query_pairs(config.join_gap, output_type="ndarray").T
+    against = -(ends.outward[first] * ends.outward[second]).sum(axis=1)
+    keep = (ends.kind[first] == ends.kind[second]) & (against > np.cos(np.radians(config.join_angle)))
+    first, second = first[keep], second[keep]
+    axis = ends.outward[first] - ends.outward[second]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    gap = ends.tip[second] - ends.tip[first]
+    along = (gap * axis).sum(axis=1)
+    aside = np.linalg.norm(gap - along[:, None] * axis, axis=1)
+    reach = config.join_aside * (1.0 + np.maximum(along, 0.0) / config.join_gap)
+    keep = (along >= -config.join_overlap) & (aside <= reach)
+    links = []
+    for row in np.flatnonzero(keep).tolist():
+        one, two = ((int(ends.element[k]), int(ends.end[k])) for k in (first[row], second[row]))
+        ahead = float(along[row])
+        if one[0] == two[0] and (ahead < 0.0 or elements[one[0]].length < SHORTEST_LOOP):
+            continue
+        if ahead > config.max_gap:
+            share = np.linspace(0.0, 1.0, int(ahead) + 2)[1:-1, None]
+            if float(np.median(views.at(ends.tip[first[row]] + share * gap[row]))) > config.join_views:
+                continue
+        links.append(_Link(abs(ahead) + 2.0 * float(aside[row]), (one, two), max(-ahead, 0.0)))
+    return links
 
 
 def _chained(elements: list[MapElement], links: Sequence[_Link]) -> list[MapElement]:
