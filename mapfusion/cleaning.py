@@ -136,13 +136,16 @@ def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]
 def _element(
     kind: ElementKind, points: Float, confidence: float, evidence: Evidence, deviation: Float | None
 ) -> MapElement:
-    return MapElement(
+    origins: dict[str, list[int]] = {}
+    for log, track in evidence.tracks:
+        origins.setdefault(log, []).append(track)
+    element = MapElement(
         kind=kind,
         points=points,
         confidence=confidence,
         observations=evidence.observations,
         first_seen=evidence.first_seen,
         last_seen=evidence.last_seen,
-        track_ids=tuple(sorted({track for _, track in evidence.tracks})),
         deviation=deviation,
     )
+    return element.with_origins({log: tuple(tracks) for log, tracks in origins.items()})

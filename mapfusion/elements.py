@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
+Origins: TypeAlias = Mapping[str, tuple[int, ...]]
+"""Names of drives or maps to the ids of the tracks in them."""
 
 
 class ElementKind(IntEnum):
@@ -122,11 +124,13 @@ class MapElement:
         confidence: in ``[0, 1]``.
         observations: number of frames that saw it.
         first_seen, last_seen: integer nanoseconds.
-        track_ids: ids of the tracks that were fused into it, ascending.
+        track_ids: ids of the tracks that were fused into it, ascending; those of several drives may be equal by
+            chance, ``source_track_ids`` tells them apart.
         deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known: 95 % of the
             true curve lies within 1.96 deviations of this one, measured across it. What of the detector's error does
             not average out is in it (:mod:`mapfusion.uncertainty`); an offset of the poses as a whole is not.
-        sources: names of the maps that it was merged from, ascending; empty for a map of one drive.
+        sources: names of the drives, or of the maps if those do not name any, that it comes from, ascending.
+        source_track_ids: ids of the tracks in each of the sources, in their order.
     """
 
     kind: ElementKind
@@ -138,11 +142,39 @@ class MapElement:
     track_ids: tuple[int, ...] = ()
     deviation: Float | None = None
     sources: tuple[str, ...] = ()
+    source_track_ids: tuple[tuple[int, ...], ...] = ()
 
     @property
     def length(self) -> float:
         """Length of the line (perimeter of a ring), metres."""
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+    @property
+    def origins(self) -> Origins:
+        """Ids of the tracks by source; those of a nameless one, ``""``, if no source is named."""
+        if not self.sources:
+            return {"": self.track_ids}
+        tracks = self.source_track_ids or ((),) * len(self.sources)
+        return dict(zip(self.sources, tracks, strict=True))
+
+    def with_origins(self, origins: Origins) -> MapElement:
+        """Return it with other sources and tracks."""
+        named = sorted(set(origins) - {""})
+        return replace(
+            self,
+            track_ids=tuple(sorted({track for tracks in origins.values() for track in tracks})),
+            sources=tuple(named),
+            source_track_ids=tuple(tuple(sorted(origins[name])) for name in named),
+        )
+
+
+def united(several: Iterable[Origins]) -> dict[str, tuple[int, ...]]:
+    """Return the sources and tracks of all of several elements."""
+    found: dict[str, set[int]] = {}
+    for origins in several:
+        for name, tracks in origins.items():
+            found.setdefault(name, set()).update(tracks)
+    return {name: tuple(sorted(tracks)) for name, tracks in found.items()}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapfusion.config import IntegratorConfig
-from mapfusion.elements import MapElement
+from mapfusion.elements import MapElement, united
 from mapfusion.geometry import arc_length
 from mapfusion.views import ViewGrid
 
@@ -211,8 +211,7 @@ def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement
         observations=max(before.observations, after.observations),
         first_seen=min(before.first_seen, after.first_seen),
         last_seen=max(before.last_seen, after.last_seen),
-        track_ids=tuple(sorted({*before.track_ids, *after.track_ids})),
-    )
+    ).with_origins(united([before.origins, after.origins]))
 
 
 def _cut_back(element: MapElement, length: float) -> tuple[Float, Float | None]:

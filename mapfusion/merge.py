@@ -22,7 +22,7 @@ from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.export.geojson import InvertibleGeoreference
 from mapfusion.export.plane import LocalPlane, common_plane
 from mapfusion.io import MapWriter, read_box, read_map
-from mapfusion.merge_lines import Contribution, MergeConfig, fuse_lines
+from mapfusion.merge_lines import Contribution, Looks, MergeConfig, fuse_lines
 from mapfusion.merge_poses import Correction, solve_corrections
 from mapfusion.merge_report import MapStatus, MergeReport, short_names
 from mapfusion.merge_rings import fuse_rings
@@ -120,7 +120,8 @@ def merge_maps(
         plane: leads from degrees to that frame, for maps that say what ground they observed.
 
     Returns:
-        The merged map; each element's ``sources`` name the maps it comes from. And what became of the maps.
+        The merged map; each element's ``sources`` name the drives it comes from, or the maps if those do not name any.
+        And what became of the maps.
     """
     names = list(names) if names is not None else [f"map {i}" for i in range(len(maps))]
     merge = _Merge(_Shelf(maps, plane), names, config or MergeConfig())
@@ -201,7 +202,7 @@ class _Merge:
         for entry in self.entries:
             if entry.place in apart:
                 for element in self.shelf.raw(entry.place):
-                    yield self._counted(replace(element, sources=(entry.name,), track_ids=()))
+                    yield self._counted(_named(element, entry.name))
 
     def report(self) -> MergeReport:
         """What came of it, once all elements were taken."""
@@ -270,7 +271,7 @@ class _Merge:
         simple = shapely.get_coordinates(shapely.simplify(line, self.config.simplify_tolerance))
         row_of = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
         deviation = np.sqrt(values[[row_of[point] for point in map(tuple, simple.tolist())], 0])
-        yield MapElement(
+        element = MapElement(
             kind=piece.kind,
             points=simple,
             confidence=float(expit(np.clip(values[:, 1], -6.0, 6.0)).mean()),
@@ -278,8 +279,8 @@ class _Merge:
             first_seen=piece.first_seen,
             last_seen=piece.last_seen,
             deviation=deviation,
-            sources=tuple(sorted(self.names[source] for source in piece.observations)),
         )
+        yield element.with_origins(piece.origins)
 
     def _each(self, direct: Any, in_worker: Any, tasks: Sequence[Any], jobs: int) -> Iterator[Any]:
         """Do the tasks here or in processes, results in order."""
@@ -337,21 +338,31 @@ def _fuse_tile(
 ) -> tuple[list[Piece], list[MapElement]]:
     """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings."""
     low, high = tile.low - config.margin, tile.high + config.margin
-    loaded = [(place, *shelf.corrected(place)) for place in places]
+    loaded = []
+    for place in places:
+        global_map, ground = shelf.corrected(place)
+        around = Looks(part for element in global_map for part in _in_box(element, low, high))
+        loaded.append((place, global_map, ground, around))
     pieces: list[Piece] = []
     rings: list[MapElement] = []
     for kind in ElementKind:
         contributions = []
-        for place, global_map, ground in loaded:
-            elements = [part for element in global_map.of_kind(kind) for part in _in_box(element, low, high)]
-            contributions.append(Contribution(place, elements, ground))
+        for place, global_map, ground, looks in loaded:
+            parts = (part for element in global_map.of_kind(kind) for part in _in_box(element, low, high))
+            elements = [_named(part, names[place]) for part in parts]
+            contributions.append(Contribution(place, elements, ground, looks))
         if kind.is_ring:
-            rings.extend(ring for ring in fuse_rings(contributions, names, config) if _owns(tile, ring))
+            rings.extend(ring for ring in fuse_rings(contributions, config) if _owns(tile, ring))
             continue
         for piece in fuse_lines(kind, contributions, config):
             for points, values in cut_line(piece.points, piece.values, tile.low, tile.high):
                 pieces.append(replace(piece, points=points, values=values))
     return pieces, rings
+
+
+def _named(element: MapElement, name: str) -> MapElement:
+    """Return an element that says where it comes from: what it says already, or the map that holds it."""
+    return element.with_origins({source or name: tracks for source, tracks in element.origins.items()})
 
 
 def _in_box(element: MapElement, low: Float, high: Float) -> list[MapElement]:

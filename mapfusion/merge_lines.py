@@ -8,18 +8,19 @@ that the order of the maps matters to where the stations stand along the line, h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import logit
 
 from mapfusion.coverage import inside
 from mapfusion.diff import settle
-from mapfusion.elements import ElementKind, MapElement
+from mapfusion.elements import ElementKind, MapElement, united
 from mapfusion.geometry import arc_length
 from mapfusion.matching import tangents
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
@@ -38,6 +39,12 @@ BLEND_LENGTH = 10.0
 SHORTEST_LOOP = 20
 """A line of fewer stations is not closed when its ends meet."""
 
+VIEW_LENGTH = 60.0
+"""A car sees about this much of a road at a time, metres."""
+
+LOOK_REACH = 8.0
+"""What lies within twice this of an element was looked at as often as it, metres."""
+
 LINK_REACH = 2.5
 """A line goes on from a reference if it leaves it this close to the reference's end, metres."""
 
@@ -52,7 +59,10 @@ class MergeConfig:
         default_deviation: of a line whose file states none and that one frame saw, metres.
         default_alike: share in the variance of such a line that is the same in all frames of a drive.
         floor_deviation: no map is trusted to be better than this, since its poses err as a whole, metres.
-        miss_log_odds: what it takes from a line that a map which looked there lacks it.
+        miss_log_odds: what each frame takes from a line that the drive lacks though it looked there. Less than in one
+            drive, since what hides a line in one frame often hides it in the next.
+        miss_limit: the most that one map can take.
+        hit_log_odds: the most that each frame of a drive that saw a line can add, whatever confidence the file states.
         log_odds_limit: more evidence than this from one map does not make it surer.
         tile, margin: side of a tile, and how far beyond its sides it looks, metres.
         simplify_tolerance: of the finished lines, metres.
@@ -67,7 +77,9 @@ class MergeConfig:
     default_deviation: float = 0.4
     default_alike: float = 0.1
     floor_deviation: float = 0.05
-    miss_log_odds: float = 0.7
+    miss_log_odds: float = 0.15
+    miss_limit: float = 2.0
+    hit_log_odds: float = 1.0
     log_odds_limit: float = 4.0
     tile: float = 200.0
     margin: float = 40.0
@@ -78,6 +90,38 @@ class MergeConfig:
     max_gap: float = 5.0
 
 
+class Looks:
+    """In how many frames a drive has looked at a place, as far as its map tells: as often as it saw what is near.
+
+    Args:
+        elements: all that the map has around.
+    """
+
+    def __init__(self, elements: Iterable[MapElement]) -> None:
+        points, frames = [np.empty((0, 2))], [np.empty(0)]
+        for element in elements:
+            samples = shapely.get_coordinates(shapely.segmentize(shapely.LineString(element.points), LOOK_REACH))
+            points.append(samples)
+            frames.append(np.full(len(samples), frames_per_place(element)))
+        self._points, self._frames = np.concatenate(points), np.concatenate(frames)
+        self._tree = cKDTree(self._points) if len(self._points) else None
+
+    def at(self, points: Float) -> Float:
+        """Return the frames for each of ``(n, 2)`` points, metres; one frame where nothing is near."""
+        frames = np.ones(len(points))
+        if self._tree is not None and len(points):
+            distance, nearest = self._tree.query(points, distance_upper_bound=2.0 * LOOK_REACH)
+            near = np.isfinite(distance)
+            frames[near] = np.maximum(self._frames[nearest[near]], 1.0)
+        return frames
+
+
+def frames_per_place(element: MapElement) -> float:
+    """Return in about how many frames each place of an element was seen: a long one is never seen as a whole."""
+    size = float(np.linalg.norm(np.ptp(element.points, axis=0)))
+    return element.observations * VIEW_LENGTH / (VIEW_LENGTH + size)
+
+
 @dataclass(frozen=True)
 class Contribution:
     """What one map has in a tile.
@@ -86,11 +130,13 @@ class Contribution:
         source: number of the map.
         elements: of one kind, metres, corrected.
         ground: what the map speaks of.
+        looks: in how many frames the drive looked where.
     """
 
     source: int
     elements: Sequence[MapElement]
     ground: shapely.Geometry
+    looks: Looks
 
 
 def information(element: MapElement, config: MergeConfig) -> Float:
@@ -103,8 +149,15 @@ def information(element: MapElement, config: MergeConfig) -> Float:
 
 
 def certainty(element: MapElement, config: MergeConfig) -> float:
-    """Log-odds that one map gives an element."""
-    return float(np.clip(logit(np.clip(element.confidence, 1e-3, 1 - 1e-3)), 0.2, config.log_odds_limit))
+    """Log-odds that one map gives an element: by its confidence, no more than its frames can bear out."""
+    most = min(config.log_odds_limit, config.hit_log_odds * max(element.observations, 1))
+    return float(np.clip(logit(np.clip(element.confidence, 1e-3, 1 - 1e-3)), 0.2, most))
+
+
+def doubt(contribution: Contribution, points: Float, config: MergeConfig) -> Float:
+    """Log-odds that a map takes from what it lacks at ``(n, 2)`` points, the more the oftener its drive looked there."""
+    taken = np.minimum(config.miss_log_odds * contribution.looks.at(points), config.miss_limit)
+    return np.asarray(taken * inside(contribution.ground, points))
 
 
 @dataclass
@@ -167,15 +220,12 @@ def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config:
     odds = references.odds.copy()
     for contribution, hit in zip(contributions, hits, strict=True):
         seen = np.concatenate([hit, np.zeros(count - len(hit), dtype=bool)])
-        odds -= config.miss_log_odds * (inside(contribution.ground, points) & ~seen)
+        odds[~seen] -= doubt(contribution, points[~seen], config)
     lines = [
-        Piece(
-            kind,
-            points[start:stop],
-            np.column_stack([1.0 / weight[start:stop], odds[start:stop]]),
-            known.observations,
-            known.first_seen,
-            known.last_seen,
+        replace(
+            known,
+            points=points[start:stop],
+            values=np.column_stack([1.0 / weight[start:stop], odds[start:stop]]),
         )
         for (start, stop), known in zip(references.spans(), references.evidence, strict=True)
     ]
@@ -218,6 +268,7 @@ def _contribute(references: _References, kind: ElementKind, contribution: Contri
                 {contribution.source: element.observations},
                 element.first_seen,
                 element.last_seen,
+                element.origins,
             )
             base = len(references.points)
             line = references.append(samples.points[take], worth[take], float(sure[rows.start]), evidence)
@@ -261,6 +312,7 @@ def _visited(
         known.observations[source] = max(known.observations.get(source, 0), element.observations)
         known.first_seen = min(known.first_seen, element.first_seen)
         known.last_seen = max(known.last_seen, element.last_seen)
+        known.origins = united([known.origins, element.origins])
     return nodes
 
 
@@ -336,18 +388,12 @@ def _blended(before: Piece, after: Piece) -> Piece:
     share = before.values[-1, 0] / (before.values[-1, 0] + values[0, 0])
     decay_before = np.exp(-np.linalg.norm(before.points - before.points[-1], axis=1) / BLEND_LENGTH)
     decay_after = np.exp(-np.linalg.norm(points - points[0], axis=1) / BLEND_LENGTH)
-    counts = dict(before.observations)
-    for source, count in after.observations.items():
-        counts[source] = max(counts.get(source, 0), count)
-    return Piece(
-        before.kind,
+    return before.with_evidence_of(
+        after,
         np.concatenate(
             [before.points + share * decay_before[:, None] * step, points - (1 - share) * decay_after[:, None] * step]
         ),
         np.concatenate([before.values, values]),
-        counts,
-        min(before.first_seen, after.first_seen),
-        max(before.last_seen, after.last_seen),
     )
 
 
@@ -355,7 +401,7 @@ def _alive(line: Piece, config: MergeConfig) -> list[Piece]:
     """Return the stretches that more likely exist than not, short gaps bridged."""
     states = settle((line.values[:, 1] > 0.0).astype(np.int64), round(config.max_gap / SPACING))
     return [
-        Piece(line.kind, line.points[a:b], line.values[a:b], dict(line.observations), line.first_seen, line.last_seen)
+        replace(line, points=line.points[a:b], values=line.values[a:b])
         for a, b, alive in runs(states)
         if alive and b - a >= 2
     ]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mapfusion.contour import level_polygons
-from mapfusion.elements import MapElement
-from mapfusion.merge_lines import Contribution, MergeConfig, certainty, information
+from mapfusion.elements import MapElement, united
+from mapfusion.merge_lines import Contribution, MergeConfig, certainty, doubt, information
 
 Float = NDArray[np.float64]
 
@@ -32,12 +32,11 @@ class _Cluster:
     sources: list[int] = field(default_factory=list)
 
 
-def fuse_rings(contributions: Sequence[Contribution], names: Sequence[str], config: MergeConfig) -> list[MapElement]:
+def fuse_rings(contributions: Sequence[Contribution], config: MergeConfig) -> list[MapElement]:
     """Fuse the crossings of several maps of one place.
 
     Args:
         contributions: one per map, in an order that does not depend on how the maps were given.
-        names: of the sources, by number.
         config: what is assumed.
 
     Returns:
@@ -52,10 +51,12 @@ def fuse_rings(contributions: Sequence[Contribution], names: Sequence[str], conf
         for contribution in contributions:
             if contribution.source not in cluster.sources:
                 shared = shapely.intersection(cluster.polygons[0], contribution.ground).area
-                sure -= config.miss_log_odds * (shared > 0.8 * cluster.polygons[0].area)
+                if shared > 0.8 * cluster.polygons[0].area:
+                    middle = shapely.get_coordinates(cluster.polygons[0].point_on_surface())
+                    sure -= float(doubt(contribution, middle, config)[0])
         outline = _outline(cluster, config)
         if sure > 0.0 and outline is not None:
-            fused.append(_element(cluster, outline, sure, names, config))
+            fused.append(_element(cluster, outline, sure, config))
     return fused
 
 
@@ -111,7 +112,7 @@ def _outline(cluster: _Cluster, config: MergeConfig) -> Float | None:
     return fused
 
 
-def _element(cluster: _Cluster, outline: Float, sure: float, names: Sequence[str], config: MergeConfig) -> MapElement:
+def _element(cluster: _Cluster, outline: Float, sure: float, config: MergeConfig) -> MapElement:
     weight = sum(float(information(ring, config).mean()) for ring in cluster.rings)
     return MapElement(
         kind=cluster.rings[0].kind,
@@ -121,5 +122,4 @@ def _element(cluster: _Cluster, outline: Float, sure: float, names: Sequence[str
         first_seen=min(ring.first_seen for ring in cluster.rings),
         last_seen=max(ring.last_seen for ring in cluster.rings),
         deviation=np.full(len(outline), 1.0 / np.sqrt(weight)),
-        sources=tuple(sorted({names[source] for source in cluster.sources})),
-    )
+    ).with_origins(united(ring.origins for ring in cluster.rings))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapfusion.elements import ElementKind
+from mapfusion.elements import ElementKind, Origins, united
 
 Float = NDArray[np.float64]
 
@@ -115,6 +115,7 @@ class Piece:
         values: ``(n, 2)``: variance across the line, m², and log-odds of existence.
         observations: frames that saw it, by source.
         first_seen, last_seen: nanoseconds.
+        origins: names of the sources, and the ids of the tracks in them.
     """
 
     kind: ElementKind
@@ -123,17 +124,16 @@ class Piece:
     observations: dict[int, int]
     first_seen: int
     last_seen: int
+    origins: Origins = field(default_factory=dict)
 
     def reversed(self) -> Piece:
         """Return it run the other way."""
-        return Piece(
-            self.kind, self.points[::-1], self.values[::-1], self.observations, self.first_seen, self.last_seen
-        )
+        return replace(self, points=self.points[::-1], values=self.values[::-1])
 
     def closed(self) -> Piece:
         """Return it led back to its start."""
         points, values = np.vstack([self.points, self.points[:1]]), np.vstack([self.values, self.values[:1]])
-        return Piece(self.kind, points, values, self.observations, self.first_seen, self.last_seen)
+        return replace(self, points=points, values=values)
 
     def joined(self, other: Piece) -> Piece:
         """Return this piece with another put to its end, their common point in the middle."""
@@ -142,11 +142,15 @@ class Piece:
         seam = len(self.points) - 1
         points[seam] = (self.points[-1] + other.points[0]) / 2
         values[seam] = (self.values[-1] + other.values[0]) / 2
+        return self.with_evidence_of(other, points, values)
+
+    def with_evidence_of(self, other: Piece, points: Float, values: Float) -> Piece:
+        """Return the line that this piece and another are parts of."""
         counts = dict(self.observations)
         for source, count in other.observations.items():
             counts[source] = max(counts.get(source, 0), count)
         first, last = min(self.first_seen, other.first_seen), max(self.last_seen, other.last_seen)
-        return Piece(self.kind, points, values, counts, first, last)
+        return Piece(self.kind, points, values, counts, first, last, united([self.origins, other.origins]))
 
 
 class Stitcher:

@@ -1,8 +1,8 @@
 """GeoPackage and FlatGeobuf through pyogrio (GDAL): the records of GeoJSON as columns.
 
 A GeoPackage has one layer of lines and one of crossings, because geographic information systems expect one type of
-geometry in a layer; a FlatGeobuf file has a single layer of both. Lists (``track_ids``, ``deviation_m``, ``sources``)
-and the provenance (metadata ``predmapnet``) are JSON texts. ``number`` keeps the order of the map.
+geometry in a layer; a FlatGeobuf file has a single layer of both. Lists (``track_ids``, ``deviation_m`` and the
+like) and the provenance (metadata ``predmapnet``) are JSON texts. ``number`` keeps the order of the map.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mapfusion.export.geojson import (
 )
 
 LINES, CROSSINGS = "lines", "crossings"
-LISTS = ("track_ids", "deviation_m", "sources")
+LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")
 METADATA = "predmapnet"
 
 

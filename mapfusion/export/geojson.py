@@ -225,6 +225,8 @@ def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any
         properties["deviation_m"] = np.round(deviation, 3).tolist()
     if element.sources:
         properties["sources"] = list(element.sources)
+        if element.source_track_ids:
+            properties["source_track_ids"] = [list(tracks) for tracks in element.source_track_ids]
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
@@ -247,6 +249,7 @@ def element_of(feature: Mapping[str, Any], georeference: InvertibleGeoreference)
         track_ids=tuple(int(track) for track in properties["track_ids"]),
         deviation=None if deviation is None else np.array(deviation, dtype=np.float64),
         sources=tuple(map(str, properties.get("sources", ()))),
+        source_track_ids=tuple(tuple(map(int, tracks)) for tracks in properties.get("source_track_ids", ())),
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import shapely
 
-from mapfusion import ElementKind, GlobalMap, MapElement, MapIntegrator
+from mapfusion import ElementKind, GlobalMap, MapElement, MapIntegrator, merge_lines
 from mapfusion.alignment import align, landmarks, move
 from mapfusion.coverage import RIM, coverage, near_elements, observed_rings
 from mapfusion.export.plane import LocalPlane
@@ -19,6 +19,7 @@ from mapfusion.merge_lines import MergeConfig
 from mapfusion.merge_report import short_names
 from tests.mapfusion.map_quality import measure
 from tests.mapfusion.simulation import simulate, town_road
+from tests.mapfusion.test_integrator_properties import frame_map
 
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
 
@@ -262,3 +263,65 @@ def test_four_drives_together_are_better_than_one(seed):
     assert together.lateral < 0.9 * np.mean([q.lateral for q in alone])
     assert together.elements_per_true <= 1.2
     assert together.ghosts_alive == 0
+
+
+def kerbs(observations: int, **more) -> list[MapElement]:
+    x = np.linspace(0.0, 60.0, 61)
+    return [
+        line(np.stack([x, y + np.sin(x / 9.0)], axis=1), BOUNDARY, observations=observations, **more)
+        for y in (-5.0, 5.0)
+    ]
+
+
+def middle(**more) -> MapElement:
+    return line([[5.0, 0.5], [55.0, 0.5]], **{"confidence": 0.95, "observations": 5, **more})
+
+
+@pytest.mark.parametrize(("frames", "alive"), [(2, True), (60, False)])
+def test_a_drive_that_looked_often_weighs_more_than_one_that_passed(frames, alive):
+    """Two drives lack a line that one has: that is much if they saw the kerbs beside it in many frames."""
+    having = GlobalMap((middle(), *kerbs(6)))
+    lacking = [GlobalMap(tuple(kerbs(frames, confidence=c))) for c in (0.9, 0.91)]
+    merged, _ = merge_maps([having, *lacking])
+    assert (len(merged.of_kind(DIVIDER)) == 1) is alive
+    assert len(merged.of_kind(BOUNDARY)) == 2
+
+
+def test_one_frame_is_not_believed_more_than_one_frame_can_say():
+    sure = MergeConfig()
+    once, often = (merge_lines.certainty(middle(confidence=0.999, observations=n), sure) for n in (1, 10))
+    assert once == pytest.approx(1.0)
+    assert often == pytest.approx(sure.log_odds_limit)
+
+
+def test_a_long_line_was_not_seen_as_a_whole_in_every_frame():
+    x = np.linspace(0.0, 540.0, 100)
+    looks = merge_lines.Looks([line(np.stack([x, 0 * x], axis=1), observations=100)])
+    assert looks.at(np.array([[200.0, 5.0], [200.0, 40.0]])) == pytest.approx([10.0, 1.0])
+
+
+def test_merged_elements_tell_their_drives_and_tracks(tmp_path):
+    ring = [[20.0, -4.0], [24.0, -4.0], [24.0, 4.0], [20.0, 4.0], [20.0, -4.0]]
+    first = GlobalMap((middle(track_ids=(3, 1)), *kerbs(6), line(ring, CROSSING, track_ids=(9,))))
+    second = GlobalMap((middle(track_ids=(3,), confidence=0.94), *kerbs(7), line(ring, CROSSING, track_ids=(4,))))
+    merged, _ = merge_maps([first, second], ["monday", "friday"])
+    (divider,), (crossing,) = merged.of_kind(DIVIDER), merged.of_kind(CROSSING)
+    assert divider.origins == {"friday": (3,), "monday": (1, 3)}
+    assert crossing.origins == {"friday": (4,), "monday": (9,)}
+    for name in ("map.geojson", "map.gpkg", "map.fgb"):
+        write_map(merged, tmp_path / name, LocalPlane(8.0, 49.0))
+        read = read_map(tmp_path / name, LocalPlane(8.0, 49.0))
+        assert [e.origins for e in read] == [e.origins for e in merged]
+    third = GlobalMap((middle(track_ids=(8,), sources=("may", "june"), source_track_ids=((8,), ())), *kerbs(5)))
+    again, _ = merge_maps([merged, third], ["city", "summer"])
+    assert again.of_kind(DIVIDER)[0].origins == {"friday": (3,), "june": (), "may": (8,), "monday": (1, 3)}
+
+
+def test_one_integrator_of_two_drives_tells_them_apart():
+    integrator = MapIntegrator()
+    for log in ("monday", "friday"):
+        for number in range(4):
+            integrator.add(frame_map([[[-20, 2], [20, 2]]], number=number, tracks=[7 if log == "monday" else 1]), log)
+    (element,) = integrator.map()
+    assert element.origins == {"friday": (1,), "monday": (7,)}
+    assert element.track_ids == (1, 7)
