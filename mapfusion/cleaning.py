@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -32,8 +33,13 @@ def log_odds(seen: Float, missed: Float, config: IntegratorConfig) -> Float:
     return np.clip(odds, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
 
 
-def line_elements(line: FusedLine, views: ViewGrid, parts: Float, config: IntegratorConfig) -> list[MapElement]:
-    """Return the stretches of a line that have evidence enough, as elements; ``parts`` of the detector's error."""
+def line_elements(
+    line: FusedLine, views: ViewGrid, parts: Float, config: IntegratorConfig, logs: Mapping[int, str]
+) -> list[MapElement]:
+    """Return the stretches of a line that have evidence enough, as elements.
+
+    ``parts`` are those of the detector's error, ``logs`` the names of the drives by number.
+    """
     curve = line.curve
     if line.evidence.observations < config.min_observations:
         return []
@@ -52,12 +58,14 @@ def line_elements(line: FusedLine, views: ViewGrid, parts: Float, config: Integr
             rows = np.append(rows, rows[0])
         part, kept = _simplify(points[rows], config.simplify_tolerance)
         sure = float(expit(odds[start:stop]).mean())
-        elements.append(_element(line.kind, part, sure, line.evidence, deviation[rows][kept]))
+        elements.append(_element(line.kind, part, sure, line.evidence, deviation[rows][kept], logs))
     return elements
 
 
-def ring_elements(ring: FusedRing, views: ViewGrid, parts: Float, config: IntegratorConfig) -> list[MapElement]:
-    """Return a crossing as an element, or nothing where the evidence is too little; ``parts`` of the error."""
+def ring_elements(
+    ring: FusedRing, views: ViewGrid, parts: Float, config: IntegratorConfig, logs: Mapping[int, str]
+) -> list[MapElement]:
+    """Return a crossing as an element, or nothing where the evidence is too little; as :func:`line_elements`."""
     if ring.evidence.observations < config.min_observations:
         return []
     held = np.argwhere(ring.level() > 0)
@@ -74,7 +82,7 @@ def ring_elements(ring: FusedRing, views: ViewGrid, parts: Float, config: Integr
     cells = np.floor(points / config.ring_cell).astype(np.int64) - ring.corner
     looked = ring.looked[cells[:, 0].clip(0, ring.looked.shape[0] - 1), cells[:, 1].clip(0, ring.looked.shape[1] - 1)]
     deviation = ring_deviations(ring, looked.astype(np.float64), parts)
-    return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation)]
+    return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation, logs)]
 
 
 def smooth(curve: Curve, config: IntegratorConfig) -> Float:
@@ -134,11 +142,16 @@ def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]
 
 
 def _element(
-    kind: ElementKind, points: Float, confidence: float, evidence: Evidence, deviation: Float | None
+    kind: ElementKind,
+    points: Float,
+    confidence: float,
+    evidence: Evidence,
+    deviation: Float | None,
+    logs: Mapping[int, str],
 ) -> MapElement:
     origins: dict[str, list[int]] = {}
     for log, track in evidence.tracks:
-        origins.setdefault(log, []).append(track)
+        origins.setdefault(logs[log], []).append(track)
     element = MapElement(
         kind=kind,
         points=points,

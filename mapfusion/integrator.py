@@ -119,11 +119,12 @@ class MapIntegrator:
         if np.abs(parts - self._parts).sum() > STALE * self._parts.sum():
             self._parts = parts
             self._dirty.update(self.lines, self.rings)
+        logs = {book.number: log for log, book in self.journal.logs.items()}
         for element in self._dirty:
             if element in self.lines:
-                found = line_elements(self.lines[element], self.views, self._parts, self.config)
+                found = line_elements(self.lines[element], self.views, self._parts, self.config, logs)
             elif element in self.rings:
-                found = ring_elements(self.rings[element], self.views, self._parts, self.config)
+                found = ring_elements(self.rings[element], self.views, self._parts, self.config, logs)
             else:
                 found = []
             if found:

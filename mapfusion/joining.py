@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mapfusion.config import IntegratorConfig
 from mapfusion.elements import MapElement, united
 from mapfusion.geometry import arc_length
+from mapfusion.tidy import tidy
 from mapfusion.views import ViewGrid
 
 Float = NDArray[np.float64]
@@ -29,6 +30,10 @@ DIRECTION_LENGTH = 4.0
 
 SHORTEST_LOOP = 8.0
 """A shorter line is not led back to its own start, metres."""
+
+
+SAME_PLACE = 0.3
+"""Ends this close are one vertex of the joined line, metres."""
 
 
 @dataclass(frozen=True)
@@ -200,12 +205,16 @@ def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement
     one, one_deviation = _cut_back(_reversed(before), overlap / 2)
     two, two_deviation = _cut_back(after, overlap / 2)
     share = before.length / max(before.length + after.length, 1e-9)
+    skip = int(len(two) > 1 and np.linalg.norm(two[0] - one[0]) < SAME_PLACE)
+    points = np.concatenate([one[::-1], two[skip:]])
+    rows = tidy(points)
+    deviation: Float | None = None
+    if one_deviation is not None and two_deviation is not None:
+        deviation = np.concatenate([one_deviation[::-1], two_deviation[skip:]])[rows]
     return replace(
         before,
-        points=np.concatenate([one[::-1], two]),
-        deviation=None
-        if one_deviation is None or two_deviation is None
-        else np.concatenate([one_deviation[::-1], two_deviation]),
+        points=points[rows],
+        deviation=deviation,
         confidence=share * before.confidence + (1.0 - share) * after.confidence,
         # frames that saw both are counted in either, so that the sum would count them twice
         observations=max(before.observations, after.observations),

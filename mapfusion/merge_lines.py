@@ -155,7 +155,7 @@ def certainty(element: MapElement, config: MergeConfig) -> float:
 
 
 def doubt(contribution: Contribution, points: Float, config: MergeConfig) -> Float:
-    """Log-odds that a map takes from what it lacks at ``(n, 2)`` points, the more the oftener its drive looked there."""
+    """Log-odds that a map takes from what it lacks at ``(n, 2)`` points; more, the oftener its drive looked there."""
     taken = np.minimum(config.miss_log_odds * contribution.looks.at(points), config.miss_limit)
     return np.asarray(taken * inside(contribution.ground, points))
 
