@@ -32,6 +32,7 @@ from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
+from predmapnet.datasets.lidar import read_argoverse2_sweep
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
@@ -299,6 +300,11 @@ class Argoverse2Scene:
             [self._poses[name][row] for name in ("tx_m", "ty_m", "tz_m")],
             f"{where}, row {row}",
         )
+
+    def lidar(self, index: int) -> Float | None:
+        """Return the lidar sweep of frame ``index``, ``(n, 3)``, metres, ego frame; None if the file is not there."""
+        path = self._folder / "sensors" / "lidar" / f"{int(self.timestamps[index])}.feather"
+        return read_argoverse2_sweep(path) if path.is_file() else None
 
     @cached_property
     def ground_truth(self) -> Argoverse2GroundTruth | None:

@@ -19,6 +19,7 @@ from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
+from predmapnet.datasets.lidar import read_nuscenes_sweep
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
@@ -342,6 +343,14 @@ class NuScenesScene:
         """Where the lidar sweep of frame ``index`` lies, or None if the file is not there."""
         path = self._root / self._frames[index].sensors[LIDAR]["filename"]
         return path if path.is_file() else None
+
+    def lidar(self, index: int) -> Float | None:
+        """Return the lidar sweep of frame ``index``, ``(n, 3)``, metres, ego frame; None if the file is not there."""
+        path = self.lidar_path(index)
+        if path is None:
+            return None
+        shifted_to_global = self.instant(index).ego_to_global
+        return read_nuscenes_sweep(path, inverse_pose(shifted_to_global) @ self.lidar_to_global(index))
 
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the official ground truth of frame ``index``, or None without a map expansion."""

@@ -161,6 +161,10 @@ class Scene(Protocol):
         """Return token, time stamp and pose of frame ``index``. Raises UserError for a broken pose."""
         ...
 
+    def lidar(self, index: int) -> Float | None:
+        """Return the lidar sweep of frame ``index``, ``(n, 3)``, metres, ego frame; None where there is no file."""
+        ...
+
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the ground truth of frame ``index``, or None where the source has no map."""
         ...

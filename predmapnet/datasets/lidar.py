@@ -1,0 +1,45 @@
+"""Lidar sweeps as the data sets store them; only the training's auxiliary depth looks at them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from predmapnet.datasets.argoverse2_files import read_table
+from predmapnet.errors import UserError
+
+Float = NDArray[np.float64]
+
+NUSCENES_COLUMNS = 5
+"""x, y, z, intensity, ring."""
+
+
+def read_nuscenes_sweep(path: Path, lidar_to_ego: Float) -> Float:
+    """Read a ``.pcd.bin`` file.
+
+    Args:
+        path: of the sweep.
+        lidar_to_ego: ``(4, 4)``.
+
+    Returns:
+        ``(n, 3) float64``, metres, ego frame.
+
+    Raises:
+        UserError: the file's length is not that of whole points.
+    """
+    numbers = np.fromfile(path, dtype="<f4")
+    if len(numbers) % NUSCENES_COLUMNS:
+        raise UserError(f"{path} is not a nuScenes lidar sweep: {len(numbers)} numbers are no whole points.")
+    points = numbers.reshape(-1, NUSCENES_COLUMNS)[:, :3].astype(np.float64)
+    return points @ lidar_to_ego[:3, :3].T + lidar_to_ego[:3, 3]
+
+
+def read_argoverse2_sweep(path: Path) -> Float:
+    """Read a lidar ``.feather`` file: ``(n, 3) float64``, metres, ego frame. Raises UserError if it is no sweep."""
+    table = read_table(path)
+    missing = {"x", "y", "z"} - table.keys()
+    if missing:
+        raise UserError(f"{path} is not a lidar sweep: it has no column {', '.join(sorted(missing))}.")
+    return np.stack([table[axis].astype(np.float64) for axis in ("x", "y", "z")], axis=1)
