@@ -12,16 +12,22 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics.jsonl and the weights.")],
     preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file.")] = "lite",
     data: Annotated[str, typer.Option(help="Data to train on: demo.")] = "demo",
-    stage: Annotated[str, typer.Option(help="single (frames), temporal (streams), or all.")] = "all",
-    minutes: Annotated[float, typer.Option(min=0.1, help="Time budget; of 'all', two thirds go to single.")] = 60.0,
+    stage: Annotated[
+        str, typer.Option(help="all, or one of: single, temporal (lite); bev, warmup, joint (paper, maptracker).")
+    ] = "all",
+    minutes: Annotated[float, typer.Option(min=0.1, help="Time budget, shared out over the stages.")] = 60.0,
     steps: Annotated[int, typer.Option(min=0, help="Limit of optimiser steps per stage; 0 for none.")] = 0,
     towns: Annotated[int, typer.Option(min=1, help="Number of training scenes.")] = 160,
-    batch: Annotated[int, typer.Option(min=1, help="Frames per step, over all processes.")] = 6,
+    batch: Annotated[
+        int | None,
+        typer.Option(min=1, help="Per step, over all processes: frames (lite: 6) or clips (paper, maptracker: 1)."),
+    ] = None,
     processes: Annotated[int, typer.Option(min=1, help="Processes that share every step.")] = 2,
     threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
     learning_rate: Annotated[
-        float, typer.Option(min=1e-6, help="Peak of the single-frame stage; take less to go on from good weights.")
-    ] = 1e-3,
+        float | None,
+        typer.Option(min=1e-6, help="Peak (lite: of stage single, 1e-3; others: 5e-4); less to go on from good ones."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of weights and draws.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
     init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
@@ -36,34 +42,22 @@ def train(
     os.environ["OMP_NUM_THREADS"] = str(threads)
 
     from predmapnet.demo_world.catalogue import default_cache
-    from predmapnet.errors import UserError
     from predmapnet.training import run
-    from predmapnet.training.optimiser import OptimiserSettings
-    from predmapnet.training.settings import Budget, TrainingSettings
+    from predmapnet.training.clip_settings import trains_in_clips
+    from predmapnet.training.settings import plan_run
 
     run.check_data(data)
-    if stage not in ("single", "temporal", "all"):
-        raise UserError(f"There is no stage '{stage}'. Choose: single, temporal, all.")
-    share = 2 / 3 if stage == "all" else 1.0
-    limit = steps or None
-    single = Budget(minutes * share, limit) if stage != "temporal" else None
-    temporal = Budget(minutes * (1 - share) if stage == "all" else minutes, limit) if stage != "single" else None
+    config = run.configuration(preset)
     options = run.RunOptions(
-        config=run.configuration(preset),
+        config=config,
         data=data,
         folder=out,
         cache=cache or default_cache() / "training",
         towns=towns,
-        validation_towns=10,
+        validation_towns=2 if trains_in_clips(config) else 10,
         processes=processes,
         threads=threads,
-        settings=TrainingSettings(
-            batch=batch,
-            seed=seed,
-            single=single,
-            temporal=temporal,
-            optimiser=OptimiserSettings(learning_rate=learning_rate),
-        ),
+        settings=plan_run(config, stage, minutes, steps or None, batch, learning_rate, seed),
         resume=resume,
         initial=init,
     )

@@ -91,8 +91,8 @@ class PoseTrackPropagation(nn.Module):
         assert isinstance(decoder, MapTrackerDecoderConfig)
         memory = recall(state.vector_memory, self.motion, ego_to_global, state.frame, decoder.memory_distances)
         past = state.ego_to_global
-        if self.config.quirks.tracks_moved_from_chosen_history:
-            # Released weights have learned with this pose, wrong or not.
+        if self.config.quirks.tracks_moved_from_chosen_history and not self.training:
+            # Released weights are run with this pose, wrong or not; in training it is that of the last frame.
             past = nearest_pose(state, ego_to_global, self.config)
         past_to_current = relative_pose(past, ego_to_global)
         pose = pose_vector(past_to_current)[:, None].expand(-1, tracks.queries.shape[1], -1)

@@ -45,12 +45,14 @@ class Batch:
         camera_valid: ``(B, N) bool``.
         ego_to_global: ``(B, 4, 4) float64``.
         targets: truth of these frames.
+        depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.training.depth_targets.depth_targets`, or None.
     """
 
     images: Tensor
     camera_valid: Tensor
     ego_to_global: Tensor
     targets: Targets
+    depth: Tensor | None = None
 
 
 @dataclass(frozen=True)

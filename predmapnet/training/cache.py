@@ -34,7 +34,7 @@ def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
     Args:
         root: folder of all training caches.
         dataset: its name.
-        config: image size and ROI are looked at.
+        config: image size, ROI and whether depth is learned are looked at.
     """
     if dataset == DEMO:
         from predmapnet.demo_world.catalogue import WORLD_VERSION
@@ -43,7 +43,8 @@ def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
     shape = f"{config.image.width}x{config.image.height}"
     seen = config.image.horizon if isinstance(config.image, ImageWindowConfig) else config.image.kind
     key = f"{seen} {config.roi_length} {config.roi_width}".encode()
-    return root / f"{dataset}-{shape}-{sha256(key).hexdigest()[:8]}"
+    lidar = "-lidar" if config.depth.enabled else ""
+    return root / f"{dataset}-{shape}-{sha256(key).hexdigest()[:8]}{lidar}"
 
 
 def fill_demo_cache(
@@ -89,6 +90,7 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
     """
     from predmapnet.datasets.ground_truth import truth_from_vector_map
     from predmapnet.demo_world.catalogue import build_world
+    from predmapnet.demo_world.lidar import scan
     from predmapnet.demo_world.renderer import Renderer
     from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 
@@ -111,7 +113,12 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
     ego_to_shifted = np.eye(4)
     ego_to_shifted[:2, 3] = -LIDAR_TO_EGO[:2, 3]
     rig = tuple(replace(camera, camera_to_ego=ego_to_shifted @ camera.camera_to_ego) for camera in DEMO_RIG)
-    write_scene(folder, rig, images, shifted, truths)
+    lidar = None
+    if config.depth.enabled:
+        lidar_to_shifted = ego_to_shifted @ LIDAR_TO_EGO
+        sweeps = (scan(renderer, frame)[:, :3].astype(np.float64) for frame in range(len(poses)))
+        lidar = [sweep @ lidar_to_shifted[:3, :3].T + lidar_to_shifted[:3, 3] for sweep in sweeps]
+    write_scene(folder, rig, images, shifted, truths, lidar)
 
 
 def window_camera(camera: Camera, config: PredMapNetConfig, factor: int) -> Camera:
@@ -137,10 +144,10 @@ def cache_scene(folder: Path, scene: Scene, config: PredMapNetConfig) -> None:
     Frames that lack an image stay out: the cache has no place for missing cameras.
 
     Raises:
-        UserError: an image is damaged, or the scene has no ground truth.
+        UserError: an image is damaged, or the scene has no ground truth or lacks lidar from which depth is learned.
     """
     images: list[NDArray[np.uint8]] = []
-    poses, truths = [], []
+    poses, truths, sweeps = [], [], []
     for index in range(len(scene)):
         frame = scene.frame(index)
         truth = scene.truth(index, config.roi)
@@ -152,6 +159,11 @@ def cache_scene(folder: Path, scene: Scene, config: PredMapNetConfig) -> None:
         images.append(np.rint(pictures).astype(np.uint8))
         poses.append(frame.ego_to_global)
         truths.append(truth)
+        if config.depth.enabled:
+            sweep = scene.lidar(index)
+            if sweep is None:
+                raise UserError(f"Scene {scene.info.name}, frame {index}, has no lidar file to learn depth from.")
+            sweeps.append(sweep)
     if not images:
         raise UserError(f"Scene {scene.info.name} has no frame with all cameras.")
-    write_scene(folder, scene.rig, np.stack(images), np.stack(poses), truths)
+    write_scene(folder, scene.rig, np.stack(images), np.stack(poses), truths, sweeps or None)

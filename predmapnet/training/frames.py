@@ -1,7 +1,8 @@
 """The training cache: scenes as arrays that the network can eat, memory-mapped from disk.
 
 One scene is one folder: ``images.npy`` after the network's preprocessing, ``frames.npz`` with poses and truth,
-``rig.json``. A folder appears under its name only when it is complete.
+``rig.json``, and ``lidar.npy`` with all sweeps one after the other where a network learns depth. A folder appears
+under its name only when it is complete.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from predmapnet.errors import UserError
 Float = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
+LIDAR = "lidar.npy"
+
 
 @dataclass(frozen=True)
 class CachedScene:
@@ -32,6 +35,7 @@ class CachedScene:
         images: ``(n, N, h, w, 3) uint8``, RGB, after the network's preprocessing; memory-mapped.
         ego_to_global: ``(n, 4, 4) float64``.
         truths: ``n`` times the truth of a frame, clipped to the ROI.
+        lidar: ``n`` sweeps ``(k_i, 3) float32``, metres, ego frame; memory-mapped; None where nobody asked for them.
     """
 
     name: str
@@ -39,12 +43,20 @@ class CachedScene:
     images: Images
     ego_to_global: Float
     truths: tuple[FrameTruth, ...]
+    lidar: tuple[NDArray[np.float32], ...] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
 
 
-def write_scene(folder: Path, rig: Rig, images: Images, ego_to_global: Float, truths: Sequence[FrameTruth]) -> None:
+def write_scene(
+    folder: Path,
+    rig: Rig,
+    images: Images,
+    ego_to_global: Float,
+    truths: Sequence[FrameTruth],
+    lidar: Sequence[Float] | None = None,
+) -> None:
     """Write one scene; the folder appears only when it is complete.
 
     Args:
@@ -53,6 +65,7 @@ def write_scene(folder: Path, rig: Rig, images: Images, ego_to_global: Float, tr
         images: ``(n, N, h, w, 3) uint8``.
         ego_to_global: ``(n, 4, 4) float64``.
         truths: one per frame.
+        lidar: one sweep ``(k, 3)`` per frame, metres, ego frame, or None.
     """
     partial = folder.with_name(f".{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -67,7 +80,10 @@ def write_scene(folder: Path, rig: Rig, images: Images, ego_to_global: Float, tr
         element_ids=np.concatenate([np.zeros(0, np.int64), *(truth.element_ids for truth in truths)]),
         vertices=np.array([len(line) for line in lines], dtype=np.int64),
         points=np.concatenate([np.zeros((0, 2)), *lines]),
+        sweeps=np.array([len(sweep) for sweep in lidar or ()], dtype=np.int64),
     )
+    if lidar is not None:
+        np.save(partial / LIDAR, np.concatenate(lidar).astype(np.float32))
     (partial / "rig.json").write_bytes(
         orjson.dumps([asdict(camera) for camera in rig], option=orjson.OPT_SERIALIZE_NUMPY)
     )
@@ -85,6 +101,7 @@ def read_scene(folder: Path) -> CachedScene:
         images = np.load(folder / "images.npy", mmap_mode="r")
         with np.load(folder / "frames.npz") as stored:
             arrays = {name: stored[name] for name in stored.files}
+        sweeps = np.load(folder / LIDAR, mmap_mode="r") if (folder / LIDAR).exists() else None
         rig = tuple(_camera(entry) for entry in orjson.loads((folder / "rig.json").read_bytes()))
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{folder} of the training cache is damaged ({error}). Delete it and train again.") from None
@@ -94,7 +111,8 @@ def read_scene(folder: Path) -> CachedScene:
         FrameTruth(arrays["kinds"][start:end], tuple(lines[start:end]), arrays["element_ids"][start:end])
         for start, end in zip(ends - arrays["pieces"], ends, strict=True)
     )
-    return CachedScene(folder.name, rig, images, arrays["ego_to_global"], truths)
+    lidar = None if sweeps is None else tuple(np.split(sweeps, np.cumsum(arrays["sweeps"])[:-1]))
+    return CachedScene(folder.name, rig, images, arrays["ego_to_global"], truths, lidar)
 
 
 def _camera(entry: dict[str, object]) -> Camera:

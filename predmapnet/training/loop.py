@@ -33,7 +33,7 @@ class Stage(Protocol[Data]):
     """What the loop needs of a stage.
 
     Attributes:
-        name: ``single`` or ``temporal``.
+        name: for example ``single`` or ``temporal``.
         frames_per_step: frames that this process sees in one step.
     """
 
@@ -162,7 +162,7 @@ class Trainer:
                 progress, interrupted, save_now, validate_now, cpu_seconds = shared
                 rate = learning_rate(step, progress, optimiser_settings)
                 for group in optimiser.param_groups:
-                    group["lr"] = rate
+                    group["lr"] = rate * group["rate"]
                 norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), optimiser_settings.clip_norm)
                 if not torch.isfinite(norm):
                     raise UserError(f"The loss of step {step} is not finite ({_readable(terms)}). Lower the rate.")

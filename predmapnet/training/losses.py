@@ -45,17 +45,17 @@ SEGMENTATION_POSITIVE_WEIGHT = 3.0
 
 
 def focal_loss(logits: Tensor, target: Tensor) -> Tensor:
-    """Sigmoid focal loss, summed.
+    """Sigmoid focal loss of each number.
 
     Args:
-        logits: ``(n, classes)``.
-        target: ``(n, classes)`` in {0, 1}.
+        logits: ``(..., classes)``.
+        target: likewise, 0 or 1.
     """
     probability = logits.sigmoid()
     entropy = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
     wrong = probability * (1 - target) + (1 - probability) * target
     alpha = FOCAL_ALPHA * target + (1 - FOCAL_ALPHA) * (1 - target)
-    return (alpha * wrong**FOCAL_GAMMA * entropy).sum()
+    return alpha * wrong**FOCAL_GAMMA * entropy
 
 
 def point_loss(points_m: Tensor, target_m: Tensor) -> Tensor:
@@ -97,6 +97,19 @@ def mask_entropy(logits: Tensor, target: Tensor) -> Tensor:
         logits, target: ``(n, H, W)``.
     """
     return functional.binary_cross_entropy_with_logits(logits, target, reduction="none").mean((1, 2)).sum()
+
+
+def mask_loss(logits: Tensor, masks: Tensor, pairs: Assignment, dice: float, entropy: float) -> Tensor:
+    """Weighted dice loss and cross-entropy (L_seg of Sec. 3.6), mean over pairs.
+
+    Args:
+        logits: ``(B, R, H, W)``.
+        masks: ``(M, H, W)`` in [0, 1].
+        pairs: rows and truth.
+        dice, entropy: weights.
+    """
+    found, drawn = logits[pairs.frame, pairs.row], masks[pairs.truth]
+    return (dice * dice_loss(found, drawn) + entropy * mask_entropy(found, drawn)) / max(len(pairs), 1)
 
 
 def segmentation_entropy(logits: Tensor, target: Tensor) -> Tensor:
@@ -165,7 +178,7 @@ def frame_losses(
     terms: dict[str, Tensor] = {}
     assignment = tracks or Assignment(*targets.frame.new_zeros((3, 0)))
     for layer in outputs.layers:
-        masks = None if layer.masks is None else _masks_of_size(targets.masks, layer.masks)
+        masks = None if layer.masks is None else masks_of_size(targets.masks, layer.masks)
         if layer.logits is not None:
             resized = targets if masks is None else Targets(**{**vars(targets), "masks": masks})
             assignment = match(
@@ -183,7 +196,7 @@ def frame_losses(
     return FrameLosses(terms, assignment)
 
 
-def _masks_of_size(masks: Tensor, like: Tensor) -> Tensor:
+def masks_of_size(masks: Tensor, like: Tensor) -> Tensor:
     """Bring drawn masks ``(M, H, W)`` to a coarser grid; a cell is set if any of its cells was."""
     if masks.shape[-2:] == like.shape[-2:] or not len(masks):
         return masks.reshape(len(masks), *like.shape[-2:])
@@ -206,7 +219,7 @@ def _layer_terms(
     if layer.logits is not None:
         wanted = torch.zeros_like(layer.logits)
         wanted[pairs.frame, pairs.row, kinds] = 1.0
-        terms["focal"] = weights.focal / positives * focal_loss(layer.logits[row_valid], wanted[row_valid])
+        terms["focal"] = weights.focal / positives * focal_loss(layer.logits[row_valid], wanted[row_valid]).sum()
     if layer.points is not None:
         points = layer.points[pairs.frame, pairs.row] * size
         rings = kinds == ElementKind.PED_CROSSING
@@ -214,8 +227,5 @@ def _layer_terms(
         terms["points"] = weights.points / positives * point_loss(points, target)
         terms["direction"] = weights.direction / positives * direction_loss(points, target)
     if layer.masks is not None and masks is not None:
-        logits, drawn = layer.masks[pairs.frame, pairs.row], masks[pairs.truth]
-        terms["mask"] = (
-            weights.mask_dice * dice_loss(logits, drawn) + weights.mask_entropy * mask_entropy(logits, drawn)
-        ) / positives
+        terms["mask"] = mask_loss(layer.masks, masks, pairs, weights.mask_dice, weights.mask_entropy)
     return terms

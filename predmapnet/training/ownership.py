@@ -28,9 +28,9 @@ class Owners:
     element_ids: Tensor
 
     @classmethod
-    def none(cls, batch: int) -> Owners:
+    def none(cls, batch: int, device: torch.device | None = None) -> Owners:
         """Return the owners of streams without tracks."""
-        return cls(*torch.full((2, batch, 0), -1))
+        return cls(*torch.full((2, batch, 0), -1, device=device))
 
 
 def owned_truth(owners: Owners, track_valid: Tensor, points: Tensor, targets: Targets, size: Tensor) -> Assignment:
@@ -107,10 +107,12 @@ def choose_tracks(
     """
     logits = outputs.layers[-1].logits
     assert logits is not None, "the last layer must classify"
-    scores = logits.detach().sigmoid().amax(2).numpy()
-    valid = outputs.row_valid.numpy()
+    device = logits.device
+    scores = logits.detach().sigmoid().amax(2).cpu().numpy()
+    valid = outputs.row_valid.cpu().numpy()
     truth = np.full(valid.shape, -1)
-    truth[assignment.frame.numpy(), assignment.row.numpy()] = assignment.truth.numpy()
+    frame, row, answer = (index.cpu().numpy() for index in (assignment.frame, assignment.row, assignment.truth))
+    truth[frame, row] = answer
     streams = [
         _choose_of_stream(scores[b], valid[b], truth[b], track_rows, settings, generator) for b in range(len(scores))
     ]
@@ -120,14 +122,9 @@ def choose_tracks(
     for b, (chosen, same) in enumerate(streams):
         rows[b, : len(chosen)], identity[b, : len(chosen)], kept[b, : len(chosen)] = chosen, same, True
     stream = np.arange(len(streams))[:, None]
-    chosen_truth = torch.from_numpy(np.where(kept, truth[stream, rows], -1))
-    return Chosen(
-        rows=torch.from_numpy(rows),
-        identity=torch.from_numpy(identity),
-        valid=torch.from_numpy(kept),
-        owners=_owners(owners, torch.from_numpy(identity), chosen_truth, targets),
-        truth=chosen_truth,
-    )
+    of_truth = np.where(kept, truth[stream, rows], -1)
+    of_rows, of_tracks, living, pieces = (torch.from_numpy(v).to(device) for v in (rows, identity, kept, of_truth))
+    return Chosen(of_rows, of_tracks, living, _owners(owners, of_tracks, pieces, targets), pieces)
 
 
 def _choose_of_stream(
@@ -169,7 +166,7 @@ def _choose_of_stream(
 def _owners(owners: Owners, identity: Tensor, truth: Tensor, targets: Targets) -> Owners:
     """A track keeps its owner for life; a newborn belongs to the truth it was assigned to."""
     batch, width = identity.shape
-    stream = torch.arange(batch)[:, None]
+    stream = torch.arange(batch, device=identity.device)[:, None]
     result = []
     for kept, of_truth in ((owners.kinds, targets.kinds), (owners.element_ids, targets.element_ids)):
         # One more column and entry stand for "none", so that -1 can be looked up.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,6 +17,8 @@ from predmapnet.threads import end_with_parent
 from predmapnet.training import checkpoint
 from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.cache import DEMO, cache_folder, fill_demo_cache
+from predmapnet.training.clip_settings import CLIP_STAGES
+from predmapnet.training.clips import ClipTraining
 from predmapnet.training.frames import read_scene
 from predmapnet.training.loop import Trainer
 from predmapnet.training.settings import TrainingSettings
@@ -149,8 +151,13 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
     lookup = network.make_rig_lookup(scenes.scenes[0].rig)
 
     def measure(average: PredMapNet, stage: str) -> dict[str, float]:
-        return validate(average, lookup, validation, streaming=stage == TemporalStage.name)
+        return validate(average, lookup, validation, streaming=stage != SingleFrameStage.name)
 
+    for clip_stage, budget in settings.clip_stages:
+        clips = ClipTraining(clip_stage, network, lookup, scenes, settings, workers)
+        optimiser = replace(settings.clip_optimiser, rates=clip_stage.rates, final_fraction=clip_stage.final_rate)
+        if not trainer.run(clips, budget, optimiser, measure if clip_stage.vectors else _no_measure):
+            return False
     if settings.single is not None:
         single = SingleFrameStage(network, lookup, scenes, settings, workers)
         if not trainer.run(single, settings.single, settings.optimiser, measure):
@@ -161,11 +168,21 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
     return True
 
 
+def _no_measure(_average: PredMapNet, _stage: str) -> dict[str, float]:
+    """A network that has not learned polylines yet is not measured."""
+    return {}
+
+
 def _check_folder(options: RunOptions) -> None:
     """Refuse to mix runs, and to train tracks on a network that sees nothing."""
     started = checkpoint.latest(options.folder) is not None
     if started and not options.resume:
         raise UserError(f"{options.folder} holds a run already. Go on with --resume, or choose another --out.")
+    clips = options.settings.clip_stages
+    if clips and (clips[0][0] is CLIP_STAGES[0] or options.resume or options.initial):
+        return
+    if clips:
+        raise UserError(f"Stage {clips[0][0].name} needs a network that sees: give --resume or --init weights.")
     if options.settings.single is None and not (options.resume or options.initial):
         raise UserError("The temporal stage needs a network that sees: give --resume or --init weights.safetensors.")
 

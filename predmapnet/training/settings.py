@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from predmapnet.config import PredMapNetConfig
+from predmapnet.errors import UserError
 from predmapnet.training.augmentation import AugmentationSettings
+from predmapnet.training.clip_settings import ClipSettings, ClipStage, choose_clip_stages, trains_in_clips
 from predmapnet.training.losses import LossWeights
 from predmapnet.training.matching import MatchingCosts
 from predmapnet.training.optimiser import OptimiserSettings
@@ -58,14 +61,28 @@ class StreamSettings:
     capacity: int = 40
 
 
+CLIP_OPTIMISER = OptimiserSettings(
+    learning_rate=5e-4,
+    betas=(0.9, 0.999),
+    weight_decay=0.01,
+    warmup_steps=500,
+    warmup_start=1 / 3,
+    clip_norm=35.0,
+)
+"""MapTracker's; rates and the end come from the stage."""
+SINGLE_SHARE = 2 / 3
+"""Of the time of a lite run, for its single-frame stage."""
+
+
 @dataclass(frozen=True)
 class TrainingSettings:
     """One run.
 
     Attributes:
-        batch: frames of one optimiser step of the single-frame stage, over all processes.
+        batch: frames of one optimiser step of the single-frame stage, or clips of one step, over all processes.
         seed: of weights, draws and augmentation.
-        single, temporal: budgets of the two stages; None skips a stage.
+        single, temporal: budgets of the two stages of the lite network; None skips a stage.
+        clip_stages: the stages of a network that trains in clips, each with its budget.
         validation_minutes, checkpoint_minutes: intervals.
         log_steps: steps between two lines of metrics.
     """
@@ -74,6 +91,7 @@ class TrainingSettings:
     seed: int = 0
     single: Budget | None = field(default_factory=Budget)
     temporal: Budget | None = None
+    clip_stages: tuple[tuple[ClipStage, Budget], ...] = ()
     validation_minutes: float = 8.0
     checkpoint_minutes: float = 3.0
     log_steps: int = 20
@@ -83,3 +101,56 @@ class TrainingSettings:
     temporal_optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(learning_rate=5e-4))
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
     streams: StreamSettings = field(default_factory=StreamSettings)
+    clips: ClipSettings = field(default_factory=ClipSettings)
+    clip_optimiser: OptimiserSettings = CLIP_OPTIMISER
+
+
+def plan_run(
+    config: PredMapNetConfig,
+    stage: str,
+    minutes: float,
+    steps: int | None,
+    batch: int | None = None,
+    learning_rate: float | None = None,
+    seed: int = 0,
+) -> TrainingSettings:
+    """Share out the time of a run over the stages of a network.
+
+    Args:
+        config: of the network.
+        stage: name of one, or ``all``.
+        minutes: of all stages together.
+        steps: limit of optimiser steps per stage, or None.
+        batch: see :class:`TrainingSettings`; 6 frames or 1 clip by default.
+        learning_rate: peak of the clip stages or of the single-frame stage; None takes the default.
+        seed: of weights and draws.
+
+    Raises:
+        UserError: the network has no such stage.
+    """
+    settings = TrainingSettings(seed=seed)
+    if trains_in_clips(config):
+        stages = choose_clip_stages(stage)
+        epochs = sum(chosen.epochs for chosen in stages)
+        return replace(
+            settings,
+            batch=batch or 1,
+            single=None,
+            clip_stages=tuple((chosen, Budget(minutes * chosen.epochs / epochs, steps)) for chosen in stages),
+            clip_optimiser=_with_rate(settings.clip_optimiser, learning_rate),
+        )
+    if stage not in ("single", "temporal", "all"):
+        raise UserError(f"There is no stage '{stage}' for this network. Choose: single, temporal, all.")
+    share = SINGLE_SHARE if stage == "all" else 1.0
+    rest = 1 - SINGLE_SHARE if stage == "all" else 1.0
+    return replace(
+        settings,
+        batch=batch or settings.batch,
+        single=Budget(minutes * share, steps) if stage != "temporal" else None,
+        temporal=Budget(minutes * rest, steps) if stage != "single" else None,
+        optimiser=_with_rate(settings.optimiser, learning_rate),
+    )
+
+
+def _with_rate(settings: OptimiserSettings, rate: float | None) -> OptimiserSettings:
+    return settings if rate is None else replace(settings, learning_rate=rate)

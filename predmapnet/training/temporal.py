@@ -180,7 +180,7 @@ def named_instances(outputs: FrameOutputs, chosen: Chosen, state: StreamState) -
     batch = len(newborn)
     # One more column stands for "no former track".
     former = torch.cat([state.instances.track_ids, state.instances.track_ids.new_full((batch, 1), -1)], 1)
-    kept_ids = former[torch.arange(batch)[:, None], chosen.identity]
+    kept_ids = former[torch.arange(batch, device=former.device)[:, None], chosen.identity]
     return instances_from_rows(outputs, chosen.rows, chosen.valid, torch.where(newborn, fresh_ids, kept_ids))
 
 

@@ -51,7 +51,8 @@ def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig
         truth = _truth(lines, pose, config.roi)
         truths.append(truth)
         images.append(_paint(truth, config))
-    write_scene(folder, DEMO_RIG, np.stack(images), poses, truths)
+    sweeps = [generator.uniform([-40, -20, 0], [40, 20, 3], (2000, 3)) for _ in poses] if config.depth.enabled else None
+    write_scene(folder, DEMO_RIG, np.stack(images), poses, truths, sweeps)
     return read_scene(folder)
 
 

@@ -7,6 +7,7 @@ import torch
 from predmapnet.training.maptracker_losses import (
     CLASS_WEIGHT,
     LINE_WEIGHT,
+    all_orders,
     assign,
     class_cost,
     layer_losses,
@@ -73,3 +74,23 @@ def test_segmentation_losses(given, expected):
     focal, dice = segmentation_losses(given["seg_logits"], given["seg_target"])
     close(focal, expected["seg_focal"])
     close(dice, expected["seg_dice"])
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2])
+def test_orders_of_the_truth_are_the_official_ones(kind):
+    folder = FOLDER.parent / "ground_truth" / "av2" / "gt"
+    files = sorted(folder.glob("*.permuted_norm.npz"))
+    if not files:
+        pytest.skip(f"no reference fixtures at {folder}: set PREDMAPNET_REFERENCE")
+    for path in files:
+        with np.load(path) as stored:
+            arrays = [stored[name] for name in stored.files if name.endswith(f"class{kind}") and len(stored[name])]
+        for official in arrays:
+            found = all_orders(torch.from_numpy(official[:, 0]), torch.full((len(official),), kind)).numpy()
+            for ours, theirs in zip(found, official.reshape(*official.shape[:2], -1), strict=True):
+                # The same orders, in whatever order they come; unused ones are far away in both.
+                distance = np.abs(ours[:, None] - theirs[None]).max(axis=-1)
+                used = np.abs(theirs).max(axis=-1) < 10
+                assert (distance.min(axis=0)[used] < 1e-6).all()
+                assert (np.abs(ours).max(axis=-1) < 10).sum() >= 2
+                assert (distance.min(axis=1)[np.abs(ours).max(axis=-1) < 10] < 1e-6).all()

@@ -1,0 +1,142 @@
+"""Training in clips: short, strided pieces of a drive, every frame of which runs the whole network (MapTracker's)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from predmapnet.config import PredMapNetConfig, ResNet50Config
+from predmapnet.datasets.source import Rig
+from predmapnet.network.camera_pillars import LEVEL_STRIDES
+from predmapnet.network.image_backbone import STRIDE
+from predmapnet.network.image_input import input_size, normalise_images
+from predmapnet.network.interface import FrameInputs, RigGeometry
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training.augmentation import change_light, drop_camera
+from predmapnet.training.batches import RASTER_GRID, Batch, TrainingScenes
+from predmapnet.training.cache import window_camera
+from predmapnet.training.clip_losses import ClipFrame, clip_losses
+from predmapnet.training.clip_settings import ClipStage
+from predmapnet.training.depth_targets import UNKNOWN, depth_targets
+from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.targets import truth_targets
+from predmapnet.training.workers import Workers
+
+
+class ImageClips:
+    """Draws clips: a random frame, and others from the frames before it."""
+
+    def __init__(
+        self,
+        scenes: TrainingScenes,
+        config: PredMapNetConfig,
+        settings: TrainingSettings,
+        clips: int,
+        seed: tuple[int, ...],
+    ) -> None:
+        self._scenes = scenes
+        self._config = config
+        self._settings = settings
+        self._clips = clips
+        self._seed = seed
+
+    def __call__(self, step: int) -> list[Batch]:
+        """Return the clips of one step, instant by instant."""
+        generator = np.random.default_rng([*self._seed, step])
+        chosen = generator.integers(len(self._scenes.frame_index), size=self._clips)
+        clips = [self._frames(int(scene), int(frame), generator) for scene, frame in self._scenes.frame_index[chosen]]
+        return [self._instant(frames, generator) for frames in zip(*clips, strict=True)]
+
+    def _frames(self, scene: int, last: int, generator: np.random.Generator) -> list[tuple[int, int]]:
+        """Scene and number of each frame of a clip; before the first frame of a scene the first one stands in."""
+        clip = self._settings.clips
+        back = generator.choice(np.arange(1, clip.span + 1), clip.frames - 1, replace=False)
+        return [(scene, max(0, last - int(steps))) for steps in sorted(back, reverse=True)] + [(scene, last)]
+
+    def _instant(self, frames: tuple[tuple[int, int], ...], generator: np.random.Generator) -> Batch:
+        augmentation, config = self._settings.augmentation, self._config
+        loaded = [self._scenes.load(scene, frame, mirrored=False) for scene, frame in frames]
+        images = [change_light(frame.images, augmentation, generator) for frame in loaded]
+        valid = [drop_camera(len(frame.images), augmentation, generator) for frame in loaded]
+        depth = None
+        if config.depth.enabled:
+            depth = torch.from_numpy(np.stack([self._depth(scene, frame) for scene, frame in frames]))
+        return Batch(
+            images=torch.from_numpy(np.stack(images)),
+            camera_valid=torch.from_numpy(np.stack(valid)),
+            ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            targets=truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, RASTER_GRID),
+            depth=depth,
+        )
+
+    def _depth(self, scene: int, frame: int) -> np.ndarray:
+        """Depth targets of one frame; cells of padding are unknown."""
+        stored, config = self._scenes.scenes[scene], self._config
+        assert stored.lidar is not None, "the cache of a network that learns depth holds lidar"
+        rig: Rig = tuple(window_camera(camera, config, 1) for camera in stored.rig)
+        stride = LEVEL_STRIDES[0] if isinstance(config.backbone, ResNet50Config) else STRIDE
+        targets = depth_targets(stored.lidar[frame].astype(np.float64), rig, stride, config.depth)
+        missing = [
+            -(-size // stride) - cells for size, cells in zip(input_size(config.image), targets.shape[1:], strict=True)
+        ]
+        return np.pad(targets, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=UNKNOWN)
+
+
+class ClipTraining:
+    """One stage of :data:`~predmapnet.training.clip_settings.CLIP_STAGES` for the training loop.
+
+    Attributes:
+        name: of the stage.
+        frames_per_step: frames that this process sees in one step.
+    """
+
+    def __init__(
+        self,
+        stage: ClipStage,
+        network: PredMapNet,
+        lookup: RigGeometry,
+        scenes: TrainingScenes,
+        settings: TrainingSettings,
+        workers: Workers,
+    ) -> None:
+        clips = max(1, settings.batch // workers.size)
+        self.name = stage.name
+        self.frames_per_step = clips * settings.clips.frames
+        self._stage = stage
+        self._network = network
+        self._lookup = lookup
+        self._settings = settings
+        self._rank = workers.rank
+        self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, workers.rank))
+
+    def begin(self) -> None:
+        """Freeze what the stage leaves as it is."""
+        self._network.requires_grad_(True)
+        for part in self._stage.frozen:
+            module = getattr(self._network, part)
+            if module is not None:
+                module.requires_grad_(False)
+
+    def losses(self, step: int, batch: list[Batch]) -> dict[str, Tensor]:
+        """Return the weighted losses of some clips."""
+        seed = np.random.default_rng([self._settings.seed, self._rank, 3, step]).integers(2**62)
+        generator = torch.Generator().manual_seed(int(seed))
+        clip = [clip_frame(instant, self._network) for instant in batch]
+        return clip_losses(self._network, self._lookup, clip, self._stage, self._settings.clips, step, generator)
+
+    def state(self) -> dict[str, Tensor]:
+        """Nothing is carried from step to step."""
+        return {}
+
+    def restore(self, tensors: dict[str, Tensor]) -> None:
+        """Nothing to restore."""
+
+
+def clip_frame(instant: Batch, network: PredMapNet) -> ClipFrame:
+    """Bring one instant to where the network is, and turn it into what it takes."""
+    device = next(network.parameters()).device
+    images = normalise_images(instant.images.to(device), network.config.image)
+    inputs = FrameInputs(images, instant.camera_valid.to(device), instant.ego_to_global.to(device))
+    depth = None if instant.depth is None else instant.depth.to(device)
+    return ClipFrame(inputs, instant.targets.to(device), depth)

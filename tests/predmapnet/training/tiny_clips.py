@@ -1,0 +1,63 @@
+"""The paper's network with all of its parts, made small, and clips of painted scenes for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from painted_scenes import painted_scene
+
+from predmapnet.config import PredMapNetConfig, preset
+from predmapnet.network.image_input import normalise_images
+from predmapnet.network.interface import FrameInputs
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training.clip_losses import ClipFrame
+from predmapnet.training.targets import truth_targets
+
+GRID = (100, 200)
+
+
+def tiny_paper_config() -> PredMapNetConfig:
+    """All parts of ``paper-nuscenes``; the image backbone is as deep, the rest narrow."""
+    changes = {
+        "image": {"width": 96, "height": 64},
+        "backbone": {"channels": 32},
+        "bev": {"rows": 12, "columns": 24, "width": 32, "heads": 4, "hidden": 32},
+        "masks": {"channels": 16},
+        "future": {"hidden": 32},
+        "decoder": {"queries": 12, "width": 32, "heads": 4, "layers": 2, "hidden": 32},
+    }
+    base = preset("paper-nuscenes").model_dump()
+    for section, values in changes.items():
+        base[section] |= values
+    return PredMapNetConfig.model_validate(base)
+
+
+def tiny_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
+    """A network in training mode that is confident enough for tracks from the first step on."""
+    torch.manual_seed(seed)
+    network = PredMapNet(config).train()
+    torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
+    return network
+
+
+def painted_clip(
+    folder: Path, config: PredMapNetConfig, frames: int, streams: int = 2
+) -> tuple[list[ClipFrame], tuple]:
+    """The first frames of painted scenes, with random depth, and their rig."""
+    scenes = [painted_scene(folder / f"scene-{seed}", frames, seed, config) for seed in range(streams)]
+    generator = torch.Generator().manual_seed(0)
+    clip = []
+    for index in range(frames):
+        images = torch.from_numpy(np.stack([scene.images[index] for scene in scenes]))
+        inputs = FrameInputs(
+            images=normalise_images(images, config.image),
+            camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
+            ego_to_global=torch.from_numpy(np.stack([scene.ego_to_global[index] for scene in scenes])),
+        )
+        cells = (streams, images.shape[1], config.image.height // 8, config.image.width // 8)
+        depth = torch.randint(-1, config.depth.bins, cells, generator=generator)
+        targets = truth_targets([scene.truths[index] for scene in scenes], config.roi, config.decoder.points, GRID)
+        clip.append(ClipFrame(inputs, targets, depth))
+    return clip, scenes[0].rig
