@@ -7,6 +7,7 @@ MapTracker's:
 - BEV encoder: :mod:`.bev_encoder` on the look-up of :mod:`.view_transform`, or :mod:`.bevformer` on the pillars of
   :mod:`.camera_pillars`
 - past BEV maps: :mod:`.temporal_bev`, or :mod:`.bev_history` with :mod:`.temporal_fusion`
+- semantic segmentation of the ground: :mod:`.segmentation_head`
 - Semantic-Aware Query Generator: :mod:`.semantic_queries`, with :mod:`.instance_masks` and :mod:`.bev_pyramid`
 - query propagation: :mod:`.track_propagation`, with :mod:`.motion_mlp` and :mod:`.vector_memory` for MapTracker's
 - History Rasterized Map Memory: :mod:`.history_memory`; History-Map Guidance: :mod:`.history_guidance`

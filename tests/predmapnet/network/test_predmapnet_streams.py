@@ -180,7 +180,7 @@ def test_gradient_reaches_every_parameter_of_every_module(make_network, make_inp
     lookup = network.make_rig_lookup(DEMO_RIG)
     state, total = None, torch.zeros(())
     generator = torch.Generator().manual_seed(1)
-    for number in range(2):
+    for number in range(3):
         inputs = make_inputs(2, seed=number, x=2.0 * number)
         outputs = network(inputs, lookup, state)
         state = network.advance(state, outputs, keep_rows(outputs, 5, first_id=10 * number), inputs)

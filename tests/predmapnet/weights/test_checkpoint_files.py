@@ -85,7 +85,7 @@ def test_damaged_missing_and_pickled_files_are_refused(saved, tmp_path):
         load_checkpoint(tmp_path / "nothing.safetensors")
     trap = tmp_path / "trap.pth"
     trap.write_bytes(pickle.dumps({"state_dict": {}}))
-    with pytest.raises(UserError, match="not a whole safetensors file"):
+    with pytest.raises(UserError, match="has to be imported first"):
         load_checkpoint(trap)
 
 
