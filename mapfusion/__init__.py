@@ -3,8 +3,10 @@
 from mapfusion.config import IntegratorConfig
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.integrator import MapIntegrator
+from mapfusion.visibility import CameraSector, visible_ground
 
 __all__ = [
+    "CameraSector",
     "ElementKind",
     "FrameMap",
     "GlobalMap",
@@ -12,4 +14,5 @@ __all__ = [
     "MapElement",
     "MapIntegrator",
     "RegionOfInterest",
+    "visible_ground",
 ]

@@ -157,7 +157,12 @@ def _maptr_frame(path: Path, entry: Mapping[str, Any]) -> SubmittedFrame:
 
 def _turned(frame: SubmittedFrame) -> SubmittedFrame:
     """From x right, y forward to x forward, y left."""
-    return replace(frame, polylines=tuple(np.column_stack([line[:, 1], -line[:, 0]]) for line in frame.polylines))
+    visible = None if frame.visible is None else tuple(map(_turned_line, frame.visible))
+    return replace(frame, polylines=tuple(map(_turned_line, frame.polylines)), visible=visible)
+
+
+def _turned_line(line: Float) -> Float:
+    return np.column_stack([line[:, 1], -line[:, 0]])
 
 
 def _placed(
@@ -201,7 +206,14 @@ def _placed(
             frame = replace(frame, track_ids=ids)
             next_track += count
         frame_map = FrameMap(
-            pose.timestamp, pose.ego_to_global, roi, frame.kinds, frame.scores, frame.track_ids, frame.polylines
+            pose.timestamp,
+            pose.ego_to_global,
+            roi,
+            frame.kinds,
+            frame.scores,
+            frame.track_ids,
+            frame.polylines,
+            visible=frame.visible,
         )
         logged.append(LoggedFrame(pose.scene, frame_map))
     return logged

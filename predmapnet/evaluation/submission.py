@@ -9,7 +9,8 @@ Two layouts are read; further keys are ignored.
   "labels", "global_ids"}``, tracked elements only.
 
 A vector is a list of ``[x, y]``, further coordinates dropped, or the flat list ``x0, y0, x1, y1, ...``; metres, ego
-frame (x forward, y left). Labels are 0 ped_crossing, 1 divider, 2 boundary.
+frame (x forward, y left). Labels are 0 ped_crossing, 1 divider, 2 boundary. An entry may say what ground could be seen
+with ``visible``, a list of rings, which are lists of points like vectors; a ring within another is a hole.
 """
 
 from __future__ import annotations
@@ -45,17 +46,26 @@ class SubmittedFrame:
         scores: ``(n,) float64``.
         track_ids: ``(n,) int64``; -1 where the submission has none.
         polylines: arrays ``(k, 2) float64``, metres, ego frame.
+        visible: rings around the ground that could be seen, as in ``FrameMap.visible``; None for all.
     """
 
     kinds: Integer
     scores: Float
     track_ids: Integer
     polylines: tuple[Float, ...]
+    visible: tuple[Float, ...] | None = None
 
     def at(self, instant: Instant, roi: RegionOfInterest) -> FrameMap:
         """Put the elements where and when the data set says that the frame was taken."""
         return FrameMap(
-            instant.timestamp, instant.ego_to_global, roi, self.kinds, self.scores, self.track_ids, self.polylines
+            instant.timestamp,
+            instant.ego_to_global,
+            roi,
+            self.kinds,
+            self.scores,
+            self.track_ids,
+            self.polylines,
+            visible=self.visible,
         )
 
 
@@ -143,7 +153,11 @@ def _frame_of(where: str, entry: Any) -> SubmittedFrame:
     counts = (len(polylines), len(scores), len(kinds), len(track_ids))
     if len(set(counts)) != 1:
         raise UserError(f"{where}: {counts[0]} vectors, {counts[1]} scores, {counts[2]} labels and {counts[3]} ids.")
-    return SubmittedFrame(kinds, scores, track_ids, polylines)
+    rings = entry.get("visible")
+    if rings is not None and not isinstance(rings, list):
+        raise UserError(f"{where}: visible must be a list of rings.")
+    visible = None if rings is None else tuple(_polyline(f"{where}, visible ring {i}", r) for i, r in enumerate(rings))
+    return SubmittedFrame(kinds, scores, track_ids, polylines, visible)
 
 
 def _numbers(where: str, values: Any, kind: type[np.generic]) -> NDArray[Any]:

@@ -190,3 +190,20 @@ def test_frames_of_a_demo_town_know_their_place_and_what_was_observed(predmapnet
     lost = predmapnet("integrate", "frames.parquet", "--out", "map.geojson")
     assert lost.code == 2
     assert "--origin" in lost.err
+
+
+def test_ground_that_could_not_be_seen_is_told_by_a_submission(predmapnet, tmp_path):
+    """A line of five frames, then thirty without it: gone, unless the frames say that it was hidden."""
+    line = {"vectors": [[[5, 6], [25, 6]]], "scores": [0.6], "labels": [1], "global_ids": [0]}
+    nothing = {"vectors": [], "scores": [], "labels": [], "global_ids": []}
+    right = [[[-30, -15], [30, -15], [30, 2], [-30, 2]]]
+    pose = {"scene": "log-1", "ego_to_global": np.eye(4).tolist()}
+    write(tmp_path / "poses.json", {f"t{i}": pose | {"timestamp": i * 500_000_000} for i in range(35)})
+    for visible, expected in (({}, 0), ({"visible": right}, 1)):
+        results = {f"t{i}": line if i < 5 else nothing | visible for i in range(35)}
+        write(tmp_path / "results.json", {"meta": {}, "results": results})
+        arguments = ("results.json", "--poses", "poses.json", "--origin", ORIGIN, "--out", "map.geojson")
+        assert predmapnet("integrate", *arguments).code == 0
+        assert len(read_map(tmp_path / "map.geojson", PLANE)) == expected
+    write(tmp_path / "results.json", {"meta": {}, "results": {"t0": line | {"visible": 3}}})
+    assert "visible" in predmapnet("integrate", *arguments).err
