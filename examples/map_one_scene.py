@@ -11,6 +11,7 @@ from pathlib import Path
 from mapfusion import ElementKind, MapIntegrator
 from mapfusion.export.geojson import write_geojson
 from predmapnet.datasets.selection import open_source
+from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.mapper import Mapper
 
 
@@ -19,7 +20,7 @@ def main(scene_name: str, path: Path, weights: Path | None = None) -> None:
     print(sentence)
     scene = source.open(scene_name)
     mapper = Mapper.from_checkpoint(weights)
-    integrator = MapIntegrator()
+    integrator = MapIntegrator(NETWORK_ERRORS)
     state = None
     for index in range(len(scene)):
         frame_map, state = mapper.step(scene.frame(index), state)

@@ -47,7 +47,7 @@ def line_elements(
     odds = log_odds(curve.seen, missed, config)
     alive = _supported(odds, config.weak_log_odds) & (curve.information > 1.0 / config.max_deviation**2)
     points = smooth(curve, config)
-    deviation = line_deviations(curve, parts)
+    deviation = line_deviations(curve, parts, config.common_deviation)
     elements = []
     stretches = _stretches(alive, int(config.max_gap / config.station_spacing))
     for start, stop in (part for stretch in stretches for part in _unfolded(points, *stretch)):
@@ -81,7 +81,7 @@ def ring_elements(
     points = shapely.get_coordinates(shapely.orient_polygons(shapely.simplify(outline, config.simplify_tolerance)))
     cells = np.floor(points / config.ring_cell).astype(np.int64) - ring.corner
     looked = ring.looked[cells[:, 0].clip(0, ring.looked.shape[0] - 1), cells[:, 1].clip(0, ring.looked.shape[1] - 1)]
-    deviation = ring_deviations(ring, looked.astype(np.float64), parts)
+    deviation = ring_deviations(ring, looked.astype(np.float64), parts, config.common_deviation)
     return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation, logs)]
 
 

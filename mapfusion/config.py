@@ -14,6 +14,8 @@ class IntegratorConfig:
         ring_cell: cell of the signed-distance grid in which crossings are fused, metres.
         deviation_near: standard deviation of a detection across the line beside the car, metres.
         deviation_per_metre: its growth with the distance from the car, metres per metre.
+        common_deviation: what all detections of an element have in common, so that no number of them shows it, metres;
+            known from a comparison with the truth only. It is in the stated uncertainty and changes nothing else.
         match_distance: largest mean lateral distance at which a detection can be an element, metres.
         match_angle: largest angle between their directions, degrees.
         match_overlap: shortest common stretch that identifies a line, metres (less for shorter lines).
@@ -49,6 +51,7 @@ class IntegratorConfig:
     ring_cell: float = 0.5
     deviation_near: float = 0.15
     deviation_per_metre: float = 0.35 / 30.0
+    common_deviation: float = 0.03
     match_distance: float = 1.2
     match_angle: float = 35.0
     match_overlap: float = 3.0

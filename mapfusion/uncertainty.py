@@ -2,10 +2,11 @@
 
 The error of a detection across the line is the sum of parts that differ in how long they last: one that is new in
 every frame, some that stay while the car moves on by a certain distance, one that stays as long as the track does, and
-one that no observation shows. Only what is new averages out. How much each part has is learnt from the differences
-between two detections of the same station, by the distance that the car went between them and by whether the track was
-the same (a variogram), for the whole map; how noisy a stretch of one element is, from the scatter of its own
-observations. Both start from a prior that stands for few observations.
+one that no observation shows (:attr:`mapfusion.IntegratorConfig.common_deviation`). Only what is new averages out. How
+much each of the others has is learnt from the differences between two detections of the same station, by the distance
+that the car went between them and by whether the track was the same (a variogram), for the whole map; how noisy a
+stretch of one element is, from the scatter of its own observations. Both start from a prior that stands for few
+observations.
 """
 
 from __future__ import annotations
@@ -45,11 +46,8 @@ PRIOR_OBSERVATIONS = 6.0
 WINDOW = 20
 """Stations over which the scatter of an element is averaged; as far as the errors of one detection hang together."""
 
-FLOOR = 0.03
-"""What no observation shows (the drawing of the line by few vertices, and the map's own simplification), metres."""
-
-RING_FLOOR = 0.1
-"""The same for crossings, whose corners are rounded by the cells and the cut-off of their signed distances, metres."""
+RING_ROUNDING = 0.095
+"""Corners of crossings are rounded by the cells and the cut-off of their signed distances, metres."""
 
 PROBE_SPACING = 8
 """Every so many stations differences are taken."""
@@ -214,27 +212,29 @@ class ErrorModel:
         return np.asarray(solved, dtype=np.float64)
 
 
-def line_deviations(curve: Curve, parts: Float) -> Float:
+def line_deviations(curve: Curve, parts: Float, common: float) -> Float:
     """Return the standard deviation of fused stations across the line, metres, ``(n,)``.
 
     Args:
         curve: the stations.
         parts: of :meth:`ErrorModel.parts`.
+        common: deviation that all detections of an element share, metres.
     """
     sums, marks = curve.sums, curve.marks
     mean, count = _mean_variance(parts, sums[:, OBSERVATIONS], marks[:, PLACES], marks[:, TRACKS])
     expected = _average(count * (1.0 - mean / parts.sum()).clip(0.0))
     noise = _noise(_average(sums[:, SCATTER]) / parts.sum(), expected)
-    return np.asarray(np.sqrt(noise * mean * count / np.maximum(sums[:, INFORMATION], 1e-6) + FLOOR**2))
+    return np.asarray(np.sqrt(noise * mean * count / np.maximum(sums[:, INFORMATION], 1e-6) + common**2))
 
 
-def ring_deviations(ring: FusedRing, information: Float, parts: Float) -> Float:
+def ring_deviations(ring: FusedRing, information: Float, parts: Float, common: float) -> Float:
     """Return the standard deviation of a crossing's outline, metres.
 
     Args:
         ring: the crossing.
         information: ``(n,)``, at points of its outline, 1 / m².
         parts: of :meth:`ErrorModel.parts`.
+        common: deviation that all detections of an element share, metres.
 
     Returns:
         ``(n,) float64``.
@@ -243,7 +243,7 @@ def ring_deviations(ring: FusedRing, information: Float, parts: Float) -> Float:
     seen = float(ring.evidence.observations)
     mean, count = _mean_variance(parts, seen * information / information.max(), *ring.marks)
     noise = _noise(ring.scatter / parts.sum(), seen * np.maximum(1.0 - mean.min() / parts.sum(), 0.0))
-    return np.asarray(np.sqrt(noise * mean * count / information + RING_FLOOR**2))
+    return np.asarray(np.sqrt(noise * mean * count / information + common**2 + RING_ROUNDING**2))
 
 
 def _mean_variance(parts: Float, observations: Float, places: Marks, tracks: Marks) -> tuple[Float, Float]:

@@ -17,6 +17,7 @@ from mapfusion.visibility import frame_ground
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames_io import read_frames, refuse_pickle
 from predmapnet.evaluation.submission import NOTHING, SubmittedFrame, position_name, read_submission
+from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.poses import FramePose, read_poses
 
 Float = NDArray[np.float64]
@@ -106,7 +107,7 @@ def integrate(frames: Iterable[LoggedFrame]) -> Integration:
     ordered = sorted(frames, key=lambda frame: (frame.log, frame.frame_map.timestamp))
     if not ordered:
         raise UserError("there is no frame to integrate")
-    integrator = MapIntegrator()
+    integrator = MapIntegrator(NETWORK_ERRORS)
     grounds = []
     for frame in ordered:
         before = integrator.frames

@@ -13,6 +13,7 @@ from mapfusion.integrator import MapIntegrator
 from predmapnet.datasets.source import Frame, Scene
 from predmapnet.errors import UserError
 from predmapnet.field_of_view import seen_in
+from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.mapper import CameraImages, Mapper
 
 MapSnapshot = Callable[[], GlobalMap]
@@ -92,7 +93,7 @@ def map_scene(
     """
     if len(scene) == 0:
         raise UserError(f"{scene.info.name} has no frames: there is nothing to map.")
-    integrator = MapIntegrator()
+    integrator = MapIntegrator(NETWORK_ERRORS)
     for observer in observers:
         observer.begin(scene, mapper.roi)
     start = perf_counter()

@@ -22,6 +22,7 @@ from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.frames_io import read_frames, stored_scenes
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
 from predmapnet.evaluation.submission import NOTHING, SubmittedFrame, position_name, read_submission
+from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.threads import use_threads
 
 if TYPE_CHECKING:
@@ -250,7 +251,7 @@ def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
     """Fuse what was read as mapping would have; None if nothing is tracked."""
     if not any((frame_map.track_ids >= 0).any() for frame_map in frame_maps):
         return None
-    integrator = MapIntegrator()
+    integrator = MapIntegrator(NETWORK_ERRORS)
     for frame_map in frame_maps:
         integrator.add(frame_map, log=name)
     return integrator.map()

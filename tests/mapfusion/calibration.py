@@ -1,5 +1,8 @@
 """Print how often the truth lies within the stated uncertainty: ``python -m tests.mapfusion.calibration``.
 
+With ``--towns FOLDER`` for what the shipped network sees in the towns of the demo world; the frames are kept in the
+folder for the next time.
+
 What is stated: the standard deviation of each vertex of a line across it. What is measured: of all points of the true
 lines that the drive has looked at and whose line is in the map, the share that lies within 1.96 such deviations of the
 map's line; 95 % if the deviations are honest and errors are normal.
@@ -8,6 +11,8 @@ map's line; 95 % if the deviations are honest and errors are normal.
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -18,6 +23,9 @@ from mapfusion.geometry import arc_length
 from tests.mapfusion.argoverse import LOGS, log_drive
 from tests.mapfusion.map_quality import dense, looked_at
 from tests.mapfusion.simulation import Detector, Drive, town_drive
+
+if TYPE_CHECKING:
+    from tests.mapfusion.demo_towns import MappedTown
 
 Float = NDArray[np.float64]
 
@@ -36,7 +44,7 @@ CORRELATIONS = {
 """What of the detector's variance lasts."""
 
 
-def standard_errors(fused: GlobalMap, drive: Drive) -> Float:
+def standard_errors(fused: GlobalMap, drive: Drive | MappedTown) -> Float:
     """Return the distance of true points to the map's lines across them, in deviations stated there.
 
     Args:
@@ -92,13 +100,33 @@ def drives_of(place: str, detector: Detector, frames: int, seeds: range) -> list
     return [log_drive(log, seed, frames, detector) for log in logs for seed in seeds[: (len(seeds) + 1) // 2]]
 
 
+def print_towns(folder: Path) -> None:
+    """Print the share for the shipped network, over all scenes of a split."""
+    from predmapnet.fusion import NETWORK_ERRORS
+    from tests.mapfusion.demo_towns import mapped_towns
+
+    for split in ("val", "test"):
+        found = []
+        for town in mapped_towns(folder / split, split):
+            integrator = MapIntegrator(NETWORK_ERRORS)
+            for frame in town.frames:
+                integrator.add(frame, town.name)
+            found.append(standard_errors(integrator.map(), town))
+        print(
+            f"shipped network, {split} towns of the demo world: {share_inside(np.concatenate(found)):.1%}", flush=True
+        )
+
+
 def main() -> None:
     """Print a table: rows are places, lengths of the drive and correlations, columns the noise of a frame."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--seeds", type=int, default=4, help="drives per figure")
     parser.add_argument("--frames", type=int, nargs="+", default=[10, 20, 40])
     parser.add_argument("--noise", type=float, nargs="+", default=[0.1, 0.2, 0.3, 0.5], help="metres per frame")
+    parser.add_argument("--towns", type=Path, help="only the shipped network; its frames are kept in this folder")
     options = parser.parse_args()
+    if options.towns:
+        return print_towns(options.towns)
     print("share of true points inside the stated 95 % band, by noise per frame")
     print(f"{'':13}{'frames':>7}  {'errors':16}" + "".join(f"{noise:8.1f} m" for noise in options.noise))
     for place in ("towns", *(["Argoverse 2"] if LOGS.is_dir() else [])):

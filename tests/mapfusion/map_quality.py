@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
 from tests.mapfusion.simulation import ROI, Drive, Ghost
+
+if TYPE_CHECKING:
+    from tests.mapfusion.demo_towns import MappedTown
 
 Float = NDArray[np.float64]
 STEP = 0.25
@@ -44,7 +48,7 @@ def dense(points: Float) -> Float:
     return resample(points, max(int(arc_length(points)[-1] / STEP), 1) + 1)
 
 
-def looked_at(points: Float, drive: Drive, rim: float = 1.5) -> NDArray[np.int64]:
+def looked_at(points: Float, drive: Drive | MappedTown, rim: float = 1.5) -> NDArray[np.int64]:
     """Return in how many frames each point lay in the ROI, clear of its rim."""
     count = np.zeros(len(points), dtype=np.int64)
     for frame in drive.frames:
