@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyarrow import feather
 from pydantic import ValidationError
 
 from mapfusion.geometry import inverse_pose
@@ -150,6 +151,30 @@ def test_projections_of_the_real_car_are_the_official_ones():
     expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), config.bev, config.roi)
     assert torch.equal(hits, expected_hits)
     torch.testing.assert_close(positions[hits], expected[hits], rtol=0, atol=1e-6)
+
+
+@pytest.mark.reference
+def test_the_road_ahead_stands_in_the_upright_front_camera_of_argoverse():
+    log = fixture("av2", "logs", "7fab2350-7eaf-3b7e-a39d-6937a4c1bede")
+    source = Argoverse2Source(log)
+    rig = source.open(log.name).rig
+    front = rig[0]
+    assert (front.name, front.width, front.height) == ("ring_front_center", 1550, 2048)
+    assert all((one.width, one.height) == (2048, 1550) for one in rig[1:])
+    table = feather.read_table(log / "calibration" / "intrinsics.feather").to_pylist()
+    (known,) = (row for row in table if row["sensor_name"] == "ring_front_center")
+    matrices = ego_to_image(rig, ARGOVERSE)
+    for distance in (6.0, 12.0, 24.0):
+        u, v, depth, _ = matrices[0] @ [distance, 0.0, GROUND_HEIGHT, 1.0]
+        below = front.camera_to_ego[2, 3] - GROUND_HEIGHT
+        assert depth == pytest.approx(distance - front.camera_to_ego[0, 3], abs=0.1)
+        # A level camera in the middle of the car: by the rule of three, scaled by 608 / 1550 and 608 / 2048.
+        assert u / depth == pytest.approx(known["cx_px"] * 608 / 1550, abs=6)
+        assert v / depth == pytest.approx((known["cy_px"] + known["fy_px"] * below / depth) * 608 / 2048, abs=6)
+    config = preset("paper-av2")
+    _, hits = project_pillars(torch.from_numpy(matrices), input_size(ARGOVERSE), config.bev, config.roi)
+    seen = hits.any(dim=-1)
+    assert (seen.float().mean(dim=1) > 0.05).all() and seen.any(dim=0).float().mean() > 0.95
 
 
 @pytest.mark.reference

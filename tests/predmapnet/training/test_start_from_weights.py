@@ -10,6 +10,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.checkpoint import start_from
 from predmapnet.weights.inspection import parts_of
+from tests.predmapnet.network.small_baseline import small_config
 
 SMALL = {
     "image": {"width": 64, "height": 24},
@@ -47,3 +48,11 @@ def test_weights_of_another_network_are_refused_and_named():
     wider = make(SMALL | {"decoder": {**SMALL["decoder"], "queries": 9}}, 0)
     with pytest.raises(UserError, match=r"query_generator\.content \(9, 32\) instead of \(8, 32\)"):
         start_from(whole, wider.state_dict(), Path("wider.safetensors"))
+
+
+def test_the_network_of_the_paper_begins_with_maptrackers_weights():
+    torch.manual_seed(0)
+    maptracker, paper = PredMapNet(small_config("maptracker-nuscenes")), PredMapNet(small_config("paper-nuscenes"))
+    fresh = start_from(paper, maptracker.state_dict(), Path("maptracker.safetensors"))
+    assert set(paper.state_dict()) - set(fresh) == set(maptracker.state_dict())
+    assert not [name for name in fresh if name.startswith(("image_backbone", "bev_encoder", "map_decoder"))]
