@@ -92,16 +92,14 @@ def correspond(
     Returns:
         The stations that match, in their order.
     """
-    low, high = curve.min(axis=0) - reach, curve.max(axis=0) + reach
-    near = np.flatnonzero(
-        (stations[:, 0] > low[0]) & (stations[:, 0] < high[0]) & (stations[:, 1] > low[1]) & (stations[:, 1] < high[1])
-    )
+    (left, low), (right, high) = (curve.min(axis=0) - reach).tolist(), (curve.max(axis=0) + reach).tolist()
+    x, y = stations[:, 0], stations[:, 1]
+    near = np.flatnonzero((x > left) & (x < right) & (y > low) & (y < high))
     points = stations[near]
     # |p - q|² without |p|², which does not change which q is nearest
     square = (curve[:, 0] ** 2 + curve[:, 1] ** 2) - 2.0 * (points @ curve.T)
     cosine = directions[near] @ curve_tangents.T
-    forwards = cosine > 0.0
-    one_way, any_way = np.asarray(forwards.all(axis=1)), np.asarray(forwards.any(axis=1))
+    one_way, any_way = cosine.min(axis=1) > 0.0, cosine.max(axis=1) > 0.0
     lines = owner[near]
     count = int(lines.max(initial=-1)) + 1
     feet = partial(_feet, points, cosine, curve, curve_tangents, reach, angle, end)
@@ -113,7 +111,8 @@ def correspond(
         keep &= way == one_way
     else:
         found = [
-            feet(np.where(forwards == ahead, square, np.inf), np.full(len(near), ahead)) for ahead in (True, False)
+            feet(np.where((cosine > 0.0) == ahead, square, np.inf), np.full(len(near), ahead))
+            for ahead in (True, False)
         ]
         same, opposite = (
             np.bincount(lines[kept], weights=reach - away[kept], minlength=count) for _, _, away, kept in found

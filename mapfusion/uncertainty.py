@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
+from scipy.special import expit
 
 from mapfusion.curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, Curve
 
@@ -34,11 +36,14 @@ PLACE = 5.0
 LASTING = np.array([10.0, 30.0])
 """Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
 
-PRIOR_SHARES = np.array([0.6, 0.15, 0.15, 0.1])
+PRIOR_SHARES = np.array([0.5, 0.15, 0.2, 0.15])
 """Share in the variance of a detection before anything was learnt: new in every frame, :data:`LASTING`, track."""
 
-PRIOR_SPREAD = 0.8
+PRIOR_SPREAD = 0.6
 """Standard deviation of the prior of each share."""
+
+NOTHING_LASTS = 0.1
+"""Probability, before anything was learnt, that all of the error is new in every frame."""
 
 PRIOR_OBSERVATIONS = 6.0
 """Observations that the prior of the noise of one element stands for."""
@@ -203,13 +208,33 @@ class ErrorModel:
         expected = basis @ PRIOR_SHARES
         total = max(float((contrasts * level).sum() / (contrasts * expected).sum()), LEAST_VARIANCE)
         # a squared normal variable has a variance of twice its squared mean
-        weight = np.sqrt(contrasts / 2.0) / (total * expected)
+        noise = total * expected * np.sqrt(2.0 / contrasts)
         prior = 1.0 / (total * PRIOR_SPREAD)
         solved, _ = nnls(
-            np.concatenate([basis * weight[:, None], np.eye(len(PRIOR_SHARES)) * prior]),
-            np.concatenate([level * weight, PRIOR_SHARES * total * prior]),
+            np.concatenate([basis / noise[:, None], np.eye(len(PRIOR_SHARES)) * prior]),
+            np.concatenate([level / noise, PRIOR_SHARES * total * prior]),
         )
-        return np.asarray(solved, dtype=np.float64)
+        # the mean of both answers, by how well either foretells the differences (Bayesian model averaging)
+        only_new = np.zeros(len(PRIOR_SHARES))
+        only_new[0] = max(float((contrasts * level).sum() / contrasts.sum()), LEAST_VARIANCE)
+        odds = np.log(NOTHING_LASTS / (1.0 - NOTHING_LASTS))
+        odds += _log_evidence(level - only_new[0], noise, basis[:, :1] / prior)
+        odds -= _log_evidence(level - total * expected, noise, basis / prior)
+        share = expit(odds)
+        return np.asarray(share * only_new + (1.0 - share) * solved)
+
+
+def _log_evidence(residual: Float, noise: Float, basis: Float) -> float:
+    """Return the log-likelihood of residuals under noise and unknown multiples of basis functions, up to a constant.
+
+    Args:
+        residual: ``(n,)``.
+        noise: ``(n,)``, deviations.
+        basis: ``(n, k)``, times the deviation of its coefficient.
+    """
+    factor = np.linalg.cholesky(np.diag(noise**2) + basis @ basis.T)
+    standard = solve_triangular(factor, residual, lower=True)
+    return float(-0.5 * (standard @ standard) - np.log(np.diag(factor)).sum())
 
 
 def line_deviations(curve: Curve, parts: Float, common: float) -> Float:

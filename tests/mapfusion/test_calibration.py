@@ -15,12 +15,15 @@ from tests.mapfusion.argoverse import LOGS
 from tests.mapfusion.calibration import CORRELATIONS, drives_of, errors_of, share_inside, standard_errors
 from tests.mapfusion.simulation import simulate, town_road
 
+LEAST, MOST = 0.90, 0.99
+"""Of three drives' errors, some thirty independent ones; the table of tests.mapfusion.calibration has more."""
+
 
 @pytest.mark.parametrize("noise", [0.1, 0.3, 0.5])
 @pytest.mark.parametrize("errors", ["independent", "per track", "slowly varying"])
 def test_towns_lie_within_the_stated_band(errors, noise):
     drives = drives_of("towns", CORRELATIONS[errors].scaled(noise), 20, range(50, 53))
-    assert 0.90 <= share_inside(errors_of(drives)) <= 0.99
+    assert LEAST <= share_inside(errors_of(drives)) <= MOST
 
 
 @pytest.mark.reference
@@ -29,7 +32,7 @@ def test_real_roads_lie_within_the_stated_band(errors):
     if not LOGS.is_dir():
         pytest.skip(f"no Argoverse 2 logs in {LOGS}: set PREDMAPNET_REFERENCE")
     drives = drives_of("Argoverse 2", CORRELATIONS[errors].scaled(0.3), 40, range(50, 54))
-    assert 0.90 <= share_inside(errors_of(drives)) <= 0.98
+    assert LEAST <= share_inside(errors_of(drives)) <= MOST
 
 
 def test_two_maps_of_one_place_have_not_moved_apart_beyond_their_uncertainty():
@@ -61,7 +64,7 @@ def test_a_merged_map_lies_within_its_stated_band():
             integrator.add(frame)
         maps.append(integrator.map())
     merged = merge_maps(maps)[0]
-    assert 0.88 <= share_inside(standard_errors(merged, drive)) <= 0.995
+    assert LEAST <= share_inside(standard_errors(merged, drive)) <= MOST
 
 
 def learnt(new: float, lasting: float, track: float, frames: int = 12, elements: int = 300) -> np.ndarray:
