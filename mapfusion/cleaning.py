@@ -45,6 +45,8 @@ def line_elements(
         return []
     missed = np.maximum(views.at(curve.points) - curve.seen_view, 0.0)
     odds = log_odds(curve.seen, missed, config)
+    if curve.seen.max() < config.whole_sightings and np.median(odds) <= 0.0:
+        return []
     alive = _supported(odds, config.weak_log_odds) & (curve.information > 1.0 / config.max_deviation**2)
     points = smooth(curve, config)
     deviation = line_deviations(curve, parts, config.common_deviation)

@@ -29,6 +29,8 @@ class IntegratorConfig:
         hit_log_odds, miss_log_odds: what one sighting adds and one missed sighting takes.
         weak_log_odds: stretches of a line with less than even odds but more than this stay in the map where they
             continue a stretch with more than even odds.
+        whole_sightings: a line that no stretch of was sighted so often lives or dies as a whole, by the median of its
+            stretches: a false detection is false all along, also where the car hardly looked.
         max_deviation: stretches of a line whose place is known less well are left out of the map, metres.
         min_observations: elements seen in fewer frames are left out of the map.
         min_length: shorter lines are left out of the map, metres.
@@ -65,6 +67,7 @@ class IntegratorConfig:
     hit_log_odds: float = 1.0
     miss_log_odds: float = 0.7
     weak_log_odds: float = -1.0
+    whole_sightings: float = 4.0
     max_deviation: float = 0.5
     min_observations: int = 2
     min_length: float = 2.0

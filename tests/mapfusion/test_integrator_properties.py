@@ -323,3 +323,19 @@ def same(first: GlobalMap, second: GlobalMap) -> bool:
         and replace(a, points=None, deviation=None) == replace(b, points=None, deviation=None)
         for a, b in zip(first, second, strict=True)
     )
+
+
+def test_a_ghost_dies_also_where_the_car_hardly_looked():
+    """Reported in two frames of ten, over ground of which the far end was in view in the last of them only."""
+    road = [[-30, -6], [30, -6]]
+    ghost = np.array([[20.0, 3.0], [45.0, 3.0]])
+    frames = []
+    for number in range(10):
+        place = np.eye(4)
+        place[0, 3] = 2.0 * number
+        seen = [ghost - place[:2, 3]] if number in (8, 9) else []
+        frames.append(frame_map([road, *seen], number=number, ego_to_global=place, tracks=[0, 1][: 1 + len(seen)]))
+    found = integrate(frames)
+    assert [element.track_ids for element in found] == [(0,)]
+    steady = integrate([replace(frame, timestamp=i) for i, frame in enumerate(3 * frames[8:])])
+    assert {element.track_ids for element in steady} == {(0,), (1,)}
