@@ -88,8 +88,8 @@ class LastObservationWins:
 
 
 def dense(points: Float) -> Float:
-    """Return points about one metre apart."""
-    return resample(points, max(int(arc_length(points)[-1]), 1) + 1)
+    """Return points about one metre apart, at least four, which a ring needs."""
+    return resample(points, max(int(arc_length(points)[-1]), 3) + 1)
 
 
 def element(kind: ElementKind, points: Float) -> MapElement:
