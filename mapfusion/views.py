@@ -102,8 +102,8 @@ class ViewGrid:
         cells = np.floor(points).astype(np.int64)
         tiles, inside = np.divmod(cells, TILE_CELLS)
         views = np.zeros(len(points))
-        for row, column in np.unique(tiles, axis=0):
-            tile = self.tiles.get((int(row), int(column)))
+        for row, column in set(zip(*tiles.T.tolist(), strict=True)):
+            tile = self.tiles.get((row, column))
             if tile is not None:
                 here = (tiles[:, 0] == row) & (tiles[:, 1] == column)
                 views[here] = tile[inside[here, 0], inside[here, 1]]

@@ -47,6 +47,7 @@ def frames(count: int = 40) -> list[FrameMap]:
 def filled(size: int) -> MapIntegrator:
     """An integrator that holds ``size`` lines of 40 m on a square grid, the road among them."""
     integrator = MapIntegrator()
+    integrator.journal.book("earlier")
     side = int(np.sqrt(size))
     x = np.linspace(0.0, 40.0, 41)
     for number in range(size):
@@ -54,7 +55,7 @@ def filled(size: int) -> MapIntegrator:
         points = np.stack([x + 50.0 * (column - side // 2), np.full(41, 8.0 * (row - side // 2) + 100.0)], axis=1)
         ones = np.ones(41)
         line = FusedLine(
-            ElementKind.DIVIDER, Curve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {("", 1): 5})
+            ElementKind.DIVIDER, Curve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {(0, 1): 5})
         )
         integrator.put_line(number, line)
     integrator.next_id = size
