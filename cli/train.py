@@ -23,6 +23,7 @@ def train(
         typer.Option(min=1, help="Per step, over all processes: frames (lite: 6) or clips (paper, maptracker: 1)."),
     ] = None,
     processes: Annotated[int, typer.Option(min=1, help="Processes that share every step.")] = 2,
+    device: Annotated[str, typer.Option(help="cpu, or cuda with --processes 1.")] = "cpu",
     threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
     learning_rate: Annotated[
         float | None,
@@ -60,6 +61,7 @@ def train(
         settings=plan_run(config, stage, minutes, steps or None, batch, learning_rate, seed),
         resume=resume,
         initial=init,
+        device=device,
     )
     typer.echo(
         f"Training '{preset}' on {towns} scenes of '{data}' for {minutes:g} minutes (stage {stage}) "

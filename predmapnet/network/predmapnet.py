@@ -101,13 +101,18 @@ class PredMapNet(nn.Module):
         self.depth_head = DepthHead(config.backbone.channels, config.depth) if config.depth.enabled else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.query_generator.content.device
+
     def make_rig_lookup(self, rig: Rig) -> RigGeometry:
         """Precompute where a rig sees the ground (cameras at the size of their stored images)."""
-        return make_rig_geometry(rig, self.config).to(self.query_generator.content.device)
+        return make_rig_geometry(rig, self.config).to(self.device)
 
     def initial_state(self, batch: int) -> StreamState:
         """Return the state before the first frame of ``batch`` streams: no tracks, nothing remembered."""
-        config, device = self.config, self.query_generator.content.device
+        config, device = self.config, self.device
         points, histories = config.decoder.points, config.future.histories
         floats, integers = torch.zeros(batch, 0, device=device), torch.zeros(batch, 0, dtype=torch.int64, device=device)
         maps, poses, valid = empty_memory(batch, config, device)

@@ -54,6 +54,16 @@ class Batch:
     targets: Targets
     depth: Tensor | None = None
 
+    def to(self, device: torch.device) -> Batch:
+        """Move every tensor to ``device``."""
+        return Batch(
+            images=self.images.to(device),
+            camera_valid=self.camera_valid.to(device),
+            ego_to_global=self.ego_to_global.to(device),
+            targets=self.targets.to(device),
+            depth=None if self.depth is None else self.depth.to(device),
+        )
+
 
 @dataclass(frozen=True)
 class LoadedFrame:

@@ -17,13 +17,13 @@ from predmapnet.config import EncoderBevMemoryConfig
 from predmapnet.errors import UserError
 from predmapnet.network.bev_history import keep_map
 from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
+from predmapnet.network.interface import FrameInputs, FrameOutputs, ImageFeatures, RigGeometry, StreamState
 from predmapnet.network.maptracker_decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.track_propagation import PoseTrackPropagation
 from predmapnet.network.tracking import instances_from_rows
 from predmapnet.training.clip_settings import ClipSettings, ClipStage
-from predmapnet.training.depth_targets import depth_loss
+from predmapnet.training.depth_targets import UNKNOWN, depth_loss
 from predmapnet.training.losses import focal_loss, forecast_loss, mask_loss, masks_of_size
 from predmapnet.training.maptracker_losses import (
     CLASS_WEIGHT,
@@ -102,29 +102,18 @@ def clip_losses(
         network.propagation, PoseTrackPropagation
     ):
         raise UserError(f"{network.config.name} does not train in clips: it has not MapTracker's decoder and memory.")
-    batch, device = len(clip[0].inputs.images), clip[0].inputs.images.device
-    state = network.initial_state(batch)
-    points = state.instances.points
-    past = Past(state, Owners.none(batch, device), state.instances.labels, points.flatten(2))
+    past = _no_past(network, len(clip[0].inputs.images))
     terms: dict[str, Tensor] = {}
     for number, frame in enumerate(clip):
-        coming = clip[number + 1].targets if number + 1 < len(clip) else None
-        seen = past.state
-        if number and stage.vectors:
-            seen = with_pose_noise(
-                seen, frame.inputs.ego_to_global, settings.angle_noise, settings.distance_noise, generator
-            )
-            if step < stage.memory_from_step:
-                seen = _without_memory(seen)
+        seen = _as_seen(past.state, frame.inputs, stage, settings, step, generator) if number else past.state
         with torch.set_grad_enabled(stage.trains_images(number, len(clip))):
             images = network.encode_images(frame.inputs)
+            _add(terms, _depth_terms(images, frame, settings))
         bev = network.encode_bev(images, frame.inputs, lookup, seen)
-        if stage.trains_images(number, len(clip)) and images.depth is not None and frame.depth is not None:
-            _add(terms, {"depth": settings.depth * depth_loss(images.depth, frame.depth)})
         if not stage.vectors:
             _add(terms, _segmentation_terms(network.segmentation_head(bev.levels[0]), frame.targets))
-            memory = keep_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)
-            past.state = _with_maps(past.state, memory, frame.inputs.ego_to_global)
+            maps = keep_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)
+            past.state = _with_maps(past.state, maps, frame.inputs.ego_to_global)
             continue
         outputs = network.decode_bev(bev, frame.inputs, seen)
         _add(terms, _segmentation_terms(outputs.segmentation, frame.targets))
@@ -133,9 +122,31 @@ def clip_losses(
         vector_terms, assigned = _vector_terms(network, outputs, frame.targets, past, settings)
         _add(terms, vector_terms)
         past = _next_tracks(network, outputs, frame, past, assigned, settings)
-        if coming is not None and network.future_guidance is not None:
-            _add(terms, {"forecast": settings.forecast * _forecast(past, coming, network)})
+        if number + 1 < len(clip) and network.future_guidance is not None:
+            _add(terms, {"forecast": settings.forecast * _forecast(past, clip[number + 1].targets, network)})
     return terms
+
+
+def _no_past(network: PredMapNet, batch: int) -> Past:
+    state = network.initial_state(batch)
+    nothing = state.instances
+    return Past(state, Owners.none(batch, network.device), nothing.labels, nothing.points.flatten(2))
+
+
+def _as_seen(
+    state: StreamState,
+    inputs: FrameInputs,
+    stage: ClipStage,
+    settings: ClipSettings,
+    step: int,
+    generator: torch.Generator,
+) -> StreamState:
+    """Return the state as the network is shown it: with wrong poses, and without the vector memory at first."""
+    if not stage.vectors:
+        return state
+    noise = settings.angle_noise, settings.distance_noise
+    state = with_pose_noise(state, inputs.ego_to_global, *noise, generator)
+    return state if step >= stage.memory_from_step else _without_memory(state)
 
 
 def _add(terms: dict[str, Tensor], more: dict[str, Tensor]) -> None:
@@ -160,6 +171,14 @@ def _with_maps(state: StreamState, memory: tuple[Tensor, Tensor, Tensor], ego_to
         ego_to_global=ego_to_global,
         frame=state.frame + 1,
     )
+
+
+def _depth_terms(images: ImageFeatures, frame: ClipFrame, settings: ClipSettings) -> dict[str, Tensor]:
+    """L_depth, of frames whose images are trained on."""
+    if images.depth is None or frame.depth is None or not torch.is_grad_enabled():
+        return {}
+    blind = ~frame.inputs.camera_valid[:, :, None, None]
+    return {"depth": settings.depth * depth_loss(images.depth, frame.depth.masked_fill(blind, UNKNOWN))}
 
 
 def _segmentation_terms(logits: Tensor, targets: Targets) -> dict[str, Tensor]:
@@ -267,7 +286,7 @@ def _next_tracks(
     born = keep & (outputs.row_track_ids < 0)
     new_ids = past.state.next_track_id[:, None] + born.long().cumsum(dim=1) - 1
     ids = torch.where(born, new_ids, outputs.row_track_ids)
-    instances: Instances = instances_from_rows(outputs, rows, valid, ids.gather(1, rows))
+    instances = instances_from_rows(outputs, rows, valid, ids.gather(1, rows))
 
     batch, width = keep.shape
     answers = torch.full((batch * width,), -1, device=keep.device).scatter(0, assigned.rows, assigned.truth)

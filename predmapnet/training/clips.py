@@ -10,8 +10,8 @@ from predmapnet.config import PredMapNetConfig, ResNet50Config
 from predmapnet.datasets.source import Rig
 from predmapnet.network.camera_pillars import LEVEL_STRIDES
 from predmapnet.network.image_backbone import STRIDE
-from predmapnet.network.image_input import input_size, normalise_images
-from predmapnet.network.interface import FrameInputs, RigGeometry
+from predmapnet.network.image_input import input_size
+from predmapnet.network.interface import RigGeometry
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.augmentation import change_light, drop_camera
 from predmapnet.training.batches import RASTER_GRID, Batch, TrainingScenes
@@ -20,6 +20,7 @@ from predmapnet.training.clip_losses import ClipFrame, clip_losses
 from predmapnet.training.clip_settings import ClipStage
 from predmapnet.training.depth_targets import UNKNOWN, depth_targets
 from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.single_frame import frame_inputs
 from predmapnet.training.targets import truth_targets
 from predmapnet.training.workers import Workers
 
@@ -135,8 +136,5 @@ class ClipTraining:
 
 def clip_frame(instant: Batch, network: PredMapNet) -> ClipFrame:
     """Bring one instant to where the network is, and turn it into what it takes."""
-    device = next(network.parameters()).device
-    images = normalise_images(instant.images.to(device), network.config.image)
-    inputs = FrameInputs(images, instant.camera_valid.to(device), instant.ego_to_global.to(device))
-    depth = None if instant.depth is None else instant.depth.to(device)
-    return ClipFrame(inputs, instant.targets.to(device), depth)
+    instant = instant.to(network.device)
+    return ClipFrame(frame_inputs(instant, network.config), instant.targets, instant.depth)

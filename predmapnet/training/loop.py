@@ -26,7 +26,7 @@ from predmapnet.training.workers import Workers
 Data = TypeVar("Data")
 Report = Callable[[str], None]
 Validate = Callable[[PredMapNet, str], dict[str, float]]
-"""Called with the averaged network and the stage's name; returns metrics by name."""
+"""Called with the averaged network and the stage's name; returns metrics by name, none where nothing is measured."""
 
 
 class Stage(Protocol[Data]):
@@ -181,9 +181,9 @@ class Trainer:
                 if validate_now or (done and not interrupted):
                     last_validated = seconds
                     if workers.leads:
-                        self._log(
-                            {f"val_{k}": v for k, v in validate(self.average.network, stage.name).items()}, progress
-                        )
+                        figures = validate(self.average.network, stage.name)
+                        if figures:
+                            self._log({f"val_{name}": value for name, value in figures.items()}, progress)
                 if done and not interrupted:
                     position.finished.append(stage.name)
                 if save_now or interrupted or done:

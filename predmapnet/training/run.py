@@ -51,6 +51,7 @@ class RunOptions:
         settings: how it trains.
         resume: go on from the newest checkpoint in ``folder``.
         initial: weights to start from, or None.
+        device: where the network is trained, as torch names it.
     """
 
     config: PredMapNetConfig
@@ -64,6 +65,7 @@ class RunOptions:
     settings: TrainingSettings
     resume: bool = False
     initial: Path | None = None
+    device: str = "cpu"
 
 
 def train(options: RunOptions, report: Report = print) -> Path | None:
@@ -75,6 +77,7 @@ def train(options: RunOptions, report: Report = print) -> Path | None:
     Raises:
         UserError: data, checkpoint or weights do not fit.
     """
+    _check_device(options)
     _check_folder(options)
     fill_demo_cache(_cache(options), _names(options, "train"), options.config, options.processes, report)
     fill_demo_cache(_cache(options), _names(options, "val"), options.config, options.processes, report)
@@ -143,6 +146,7 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
         initial = load_checkpoint(options.initial).network.state_dict()
         if fresh := checkpoint.start_from(network, initial, options.initial):
             report(f"Not in {options.initial.name}, so begun at random: {', '.join(parts_of(fresh))}.")
+    network.to(options.device)
     trainer = Trainer(network, settings, options.folder, workers, report)
     if options.resume:
         trainer.resume()
@@ -171,6 +175,14 @@ def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
 def _no_measure(_average: PredMapNet, _stage: str) -> dict[str, float]:
     """A network that has not learned polylines yet is not measured."""
     return {}
+
+
+def _check_device(options: RunOptions) -> None:
+    """Refuse a device that is not there, or that several processes would have to share."""
+    if options.device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"There is no device {options.device} here, or this torch was built without CUDA.")
+    if options.device != "cpu" and options.processes > 1:
+        raise UserError(f"Training on {options.device} takes one process: give --processes 1.")
 
 
 def _check_folder(options: RunOptions) -> None:

@@ -47,7 +47,7 @@ class SingleFrameStage:
         self._network = network
         self._lookup = lookup
         self._settings = settings
-        self._size = roi_size(network.config)
+        self._size = roi_size(network.config).to(network.device)
         self.make_batch = SingleFrameBatches(
             scenes,
             self.frames_per_step,
@@ -63,6 +63,7 @@ class SingleFrameStage:
 
     def losses(self, step: int, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of one batch."""
+        batch = batch.to(self._network.device)
         outputs = self._network(frame_inputs(batch, self._network.config), self._lookup, None)
         settings = self._settings
         return frame_losses(outputs, batch.targets, self._size, settings.weights, settings.costs).terms

@@ -64,6 +64,16 @@ class Clip:
     after: Targets
     plan: StreamPlan
 
+    def to(self, device: torch.device) -> Clip:
+        """Move every tensor to ``device``."""
+        return Clip(
+            instants=[instant.to(device) for instant in self.instants],
+            features=[BevFeatures([level.to(device) for level in one.levels]) for one in self.features],
+            fresh=self.fresh.to(device),
+            after=self.after.to(device),
+            plan=self.plan,
+        )
+
 
 class FeatureStore:
     """BEV features of all frames in half precision, one memory-mapped file per scene.
@@ -99,7 +109,7 @@ class FeatureStore:
 
     def pack(self, features: BevFeatures) -> NDArray[np.float16]:
         """Flatten the features of ``B`` frames to ``(B, values)``."""
-        packed: NDArray[np.float16] = torch.cat([level.flatten(1) for level in features.levels], 1).half().numpy()
+        packed: NDArray[np.float16] = torch.cat([level.flatten(1) for level in features.levels], 1).half().cpu().numpy()
         return packed
 
     def read(self, scenes: NDArray[np.int64], frames: NDArray[np.int64]) -> BevFeatures:

@@ -58,10 +58,10 @@ class TemporalStage:
         self._folder = folder
         self._workers = workers
         self._report = report
-        self._size = roi_size(network.config)
+        self._size = roi_size(network.config).to(network.device)
         self._plan = StreamPlan.start(settings.streams.streams)
         self._state = network.initial_state(settings.streams.streams)
-        self._owners = Owners.none(settings.streams.streams)
+        self._owners = Owners.none(settings.streams.streams, network.device)
         self._clips: StreamClips | None = None
 
     def begin(self) -> None:
@@ -93,7 +93,8 @@ class TemporalStage:
         settings = self._settings.streams
         generator = np.random.default_rng([self._settings.seed, self._workers.rank, 2, step])
         forgetful = torch.from_numpy(generator.random(settings.streams) < settings.state_dropout)
-        state = forget(self._state, batch.fresh | forgetful)
+        batch = batch.to(self._network.device)
+        state = forget(self._state, batch.fresh | forgetful.to(batch.fresh.device))
         owners = self._owners
         terms: dict[str, Tensor] = {}
         following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
@@ -138,6 +139,7 @@ class TemporalStage:
             return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
         self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
+        tensors = {name: value.to(self._network.device) for name, value in tensors.items()}
         self._owners = Owners(**part("owners."))
         self._state = StreamState.from_tensors(part("state."))
         if self._clips is not None:
@@ -149,7 +151,7 @@ class TemporalStage:
         for part in FROZEN:
             module = getattr(self._network, part)
             for value in [] if module is None else module.state_dict().values():
-                digest.update(value.contiguous().numpy().tobytes())
+                digest.update(value.cpu().contiguous().numpy().tobytes())
         return f"features-{digest.hexdigest()[:12]}"
 
     @torch.no_grad()
@@ -163,10 +165,11 @@ class TemporalStage:
                 for start in range(0, frames, ENCODE_BATCH):
                     stop = min(start + ENCODE_BATCH, frames)
                     loaded = [self._scenes.load(scene, frame, store.mirrored(scene)) for frame in range(start, stop)]
-                    images = torch.from_numpy(np.stack([frame.images for frame in loaded]))
+                    images = torch.from_numpy(np.stack([frame.images for frame in loaded])).to(self._network.device)
                     normalised = normalise_images(images, self._network.config.image)
-                    valid = torch.ones(images.shape[:2], dtype=torch.bool)
-                    inputs = FrameInputs(normalised, valid, torch.zeros(stop - start, 4, 4, dtype=torch.float64))
+                    valid = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
+                    anywhere = torch.zeros(stop - start, 4, 4, dtype=torch.float64, device=images.device)
+                    inputs = FrameInputs(normalised, valid, anywhere)
                     features = self._network.encode_bev(self._network.encode_images(inputs), inputs, self._lookup)
                     values[start:stop] = store.pack(features)
             if self._workers.leads and done % 10 == 9:

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 from mapfusion.elements import FrameMap
-from predmapnet.config import PredMapNetConfig
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
@@ -80,7 +79,7 @@ def map_frames(
     empty = network.initial_state(1)
     state = empty
     for index in indices:
-        inputs = _inputs(scene, index, config)
+        inputs = _inputs(scene, index, network)
         outputs = network(inputs, lookup, state)
         selection = select(outputs, state, config)
         after = network.advance(state, outputs, selection.instances, inputs, selection.lost)
@@ -89,10 +88,10 @@ def map_frames(
         state = after if streaming else empty
 
 
-def _inputs(scene: CachedScene, index: int, config: PredMapNetConfig) -> FrameInputs:
-    images = torch.from_numpy(np.array(scene.images[index]))[None]
+def _inputs(scene: CachedScene, index: int, network: PredMapNet) -> FrameInputs:
+    images = torch.from_numpy(np.array(scene.images[index]))[None].to(network.device)
     return FrameInputs(
-        images=normalise_images(images, config.image),
-        camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
-        ego_to_global=torch.from_numpy(scene.ego_to_global[index])[None],
+        images=normalise_images(images, network.config.image),
+        camera_valid=torch.ones(images.shape[:2], dtype=torch.bool, device=network.device),
+        ego_to_global=torch.from_numpy(scene.ego_to_global[index])[None].to(network.device),
     )

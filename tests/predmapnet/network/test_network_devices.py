@@ -1,68 +1,152 @@
-"""No tensor of the paper's network is made on the wrong device: a clip on a GPU, traced without one."""
+"""No tensor is made on the wrong device: streams and training steps on a GPU, traced with fake tensors without one."""
 
-import warnings
 from dataclasses import replace
 
 import pytest
 import torch
-from torch._subclasses.fake_tensor import FakeTensorMode
 
-from predmapnet.network.interface import FrameInputs
+from predmapnet.config import PredMapNetConfig
+from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.interface import BevFeatures
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import instances_from_rows
+from predmapnet.network.tracking import select
+from predmapnet.training.batches import Batch
+from predmapnet.training.clip_losses import clip_losses
+from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
+from predmapnet.training.clips import clip_frame
+from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
+from predmapnet.training.settings import StreamSettings, TrainingSettings
+from predmapnet.training.streams import Clip, StreamPlan
+from predmapnet.training.targets import Targets
+from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.workers import Workers
+from tests.predmapnet.network.conftest import SMALL
 from tests.predmapnet.network.small_baseline import SIZE, small_config, small_pillars
+from tests.predmapnet.pretended_gpu import pretended_gpu
 
-TRACKS = 3
-GPU = torch.device("privateuseone:0")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def pretended_gpu():
-    """A device without kernels, for fake tensors: a build of torch for CPUs refuses to slice fake CUDA tensors."""
-    registration = pytest.importorskip("torch.utils.backend_registration")
-    if not hasattr(registration, "_setup_privateuseone_for_python_backend"):
-        pytest.skip(f"torch {torch.__version__} cannot pretend to have a device")
-    registration._setup_privateuseone_for_python_backend()
+STREAMS, FRAMES = 2, 3
 
 
-def on_gpu(value, mode):
-    """The same tensor, as if it were on a GPU."""
-    return mode.from_tensor(value).detach().to(GPU)
-
-
-def tracks_of(outputs, batch):
-    """The first detections become tracks, as a trainer would choose them."""
-    rows = torch.arange(TRACKS, device=GPU).expand(batch, -1)
-    first = outputs.row_valid.shape[1] - small_config().decoder.queries
-    return instances_from_rows(outputs, first + rows, rows >= 0, rows)
-
-
-@pytest.mark.parametrize("preset", ["maptracker-nuscenes", "paper-nuscenes"])
-def test_the_frames_of_a_training_clip_stay_on_the_gpu(preset):
-    config = small_config(preset)
-    batch, cameras = 2, len(config.bev.cameras)
-    pillars = small_pillars(config)
-    assert len(pillars.camera)
+def network_of(config):
+    """An untrained network whose every row is confident enough for a track."""
+    torch.manual_seed(0)
     network = PredMapNet(config).train()
-    with FakeTensorMode(allow_non_fake_inputs=False) as mode, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for module in network.modules():
-            for name, value in list(module.named_parameters(recurse=False)):
-                setattr(module, name, torch.nn.Parameter(on_gpu(value, mode)))
-            for name, value in list(module.named_buffers(recurse=False)):
-                setattr(module, name, on_gpu(value, mode))
-        names = ("camera", "cell", "positions", "sees")
-        pillars = replace(pillars, **{name: on_gpu(getattr(pillars, name), mode) for name in names})
-        state, loss = None, torch.zeros((), device=GPU)
-        for _ in range(6):
-            inputs = FrameInputs(
-                images=torch.zeros(batch, cameras, 3, *SIZE, device=GPU),
-                camera_valid=torch.ones(batch, cameras, dtype=torch.bool, device=GPU),
-                ego_to_global=torch.eye(4, dtype=torch.float64, device=GPU).expand(batch, 4, 4),
-            )
-            outputs = network(inputs, pillars, state)
-            state = network.advance(state, outputs, tracks_of(outputs, batch), inputs)
-            loss = loss + outputs.segmentation.sum() + sum(layer.points.sum() for layer in outputs.layers[-2:])
-        assert loss.device == GPU
-        assert all(value.device == GPU for value in state.tensors().values())
-        assert state.bev_memory.shape[1] == 6
+    for name, parameter in network.named_parameters():
+        if name.endswith("classify.bias"):
+            torch.nn.init.constant_(parameter, 0.5)
+    return network
+
+
+def lookup_of(network):
+    is_lite = network.config.bev.kind == "lookup"
+    return network.make_rig_lookup(DEMO_RIG) if is_lite else small_pillars(network.config)
+
+
+def instant(config, number, size, cameras):
+    """One frame of two streams, with the same three elements in each."""
+    pieces, points = 3 * STREAMS, config.decoder.points
+    generator = torch.Generator().manual_seed(number)
+    poses = torch.eye(4, dtype=torch.float64).repeat(STREAMS, 1, 1)
+    poses[:, 0, 3] = 1000.0 + 2.0 * number
+    masks = torch.zeros(pieces, 100, 200)
+    masks[:, 40:60] = 1.0
+    return Batch(
+        images=torch.randint(0, 255, (STREAMS, cameras, *size, 3), dtype=torch.uint8, generator=generator),
+        camera_valid=torch.ones(STREAMS, cameras, dtype=torch.bool),
+        ego_to_global=poses,
+        targets=Targets(
+            batch=STREAMS,
+            frame=torch.arange(STREAMS).repeat_interleave(3),
+            kinds=torch.tensor([0, 1, 2] * STREAMS),
+            element_ids=torch.arange(pieces),
+            points=torch.rand(pieces, points, 2, generator=generator),
+            masks=masks,
+            segmentation=masks.view(STREAMS, 3, 100, 200),
+        ),
+        depth=torch.randint(-1, config.depth.bins, (STREAMS, cameras, size[0] // 8, size[1] // 8), generator=generator),
+    )
+
+
+def optimise(network, terms, gpu):
+    """One step of the optimiser and of the average; every gradient and weight is on the GPU."""
+    settings = OptimiserSettings()
+    optimiser, average = make_optimiser(network, settings), WeightAverage(network, 0.9)
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(p.grad.device == gpu.device for p in network.parameters() if p.grad is not None)
+    norm = torch.nn.utils.clip_grad_norm_(network.parameters(), settings.clip_norm)
+    assert norm.device == gpu.device
+    assert float(norm) > 0.0
+    optimiser.step()
+    average.update(network)
+    assert all(value.device == gpu.device for value in average.network.state_dict().values())
+
+
+@pytest.mark.parametrize("name", ["lite", "maptracker-nuscenes", "paper-nuscenes"])
+def test_a_stream_stays_on_the_gpu(name):
+    is_lite = name == "lite"
+    config = PredMapNetConfig.model_validate(SMALL) if is_lite else small_config(name)
+    size, cameras = ((24, 64), 6) if is_lite else (SIZE, 2)
+    network = network_of(config).eval()
+    lookup, frames = lookup_of(network), [instant(config, number, size, cameras) for number in range(FRAMES)]
+    with pretended_gpu() as gpu, torch.no_grad():
+        gpu.put_network(network)
+        lookup, state = gpu.put(lookup), None
+        for frame in frames:
+            inputs = clip_frame(frame, network).inputs
+            outputs = network(inputs, lookup, state)
+            selection = select(outputs, state, config)
+            state = network.advance(state, outputs, selection.instances, inputs, selection.lost)
+            made = [outputs.queries, outputs.segmentation, outputs.bev, *vars(selection.detections).values()]
+            assert all(value.device == gpu.device for value in [*made, *state.tensors().values()])
+        assert state.instances.valid.any(), "there were tracks"
+
+
+@pytest.mark.parametrize("stage", CLIP_STAGES, ids=lambda stage: stage.name)
+def test_a_training_step_of_the_papers_network_stays_on_the_gpu(stage):
+    config = small_config("paper-nuscenes")
+    network = network_of(config)
+    pillars = small_pillars(config)
+    frames = [instant(config, number, SIZE, 2) for number in range(FRAMES)]
+    with pretended_gpu() as gpu:
+        gpu.put_network(network)
+        clip = [clip_frame(frame, network) for frame in frames]
+        generator = torch.Generator().manual_seed(0)
+        terms = clip_losses(network, gpu.put(pillars), clip, stage, ClipSettings(), 1000, generator)
+        assert all(term.device == gpu.device for term in terms.values())
+        assert ("transformation" in terms) == stage.vectors
+        optimise(network, terms, gpu)
+
+
+def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
+    config = PredMapNetConfig.model_validate(SMALL)
+    network = network_of(config)
+    settings = TrainingSettings(streams=StreamSettings(streams=STREAMS, frames=FRAMES, score=0.05, track_dropout=0.0))
+    frames = [instant(config, number, (24, 64), 6) for number in range(FRAMES)]
+    rows, columns = config.bev.rows, config.bev.columns
+    features = BevFeatures(
+        [
+            torch.randn(STREAMS, width, -(-rows // s), -(-columns // s))
+            for width, s in zip(config.bev.widths, (1, 2, 4), strict=True)
+        ]
+    )
+    plan = StreamPlan.start(STREAMS)
+    fresh = torch.tensor([True, False])
+    clip = Clip(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
+    with pretended_gpu() as gpu:
+        gpu.put_network(network)
+        stage = TemporalStage(network, None, None, settings, tmp_path, Workers())
+        for step in range(2):
+            terms = stage.losses(step, clip)
+        assert all(term.device == gpu.device for term in terms.values())
+        assert all(value.device == gpu.device for name, value in stage.state().items() if not name.startswith("plan"))
+        assert float(terms["forecast"]) > 0.0, "there were tracks"
+        optimise(network, terms, gpu)
+
+
+def test_a_tensor_on_the_wrong_device_is_found():
+    with pretended_gpu() as gpu:
+        here = gpu.put(torch.arange(3.0))
+        assert float((here + 1.0).sum()) == 6.0
+        assert here.cpu().numpy().tolist() == [0.0, 1.0, 2.0]
+        with pytest.raises(RuntimeError, match="device"):
+            _ = here + torch.ones(3)
