@@ -121,7 +121,7 @@ class Mapper:
         windows, valid = stack_windows(images, rig, self.config.image)
         return CameraImages(windows, valid)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(
         self,
         frame: Frame,

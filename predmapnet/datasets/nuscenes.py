@@ -217,6 +217,7 @@ class NuScenesScene:
         self.georeference = georeference
         self._root = root
         self._tables = tables
+        self._sensor_poses: dict[str, Float] = {}
         self._frames = self._read_frames()
         self._cameras = self._read_cameras()
         self.rig: Rig = self.frame(0).rig
@@ -269,11 +270,17 @@ class NuScenesScene:
             token = frame.sensors[LIDAR]["ego_pose_token"]
             raise UserError(f"{self._where(index, 'ego_pose')}: the pose {token} is missing.")
         ego_to_global = _pose(frame.ego_pose, self._where(index, "ego_pose"))
-        lidar_to_ego = _pose(self._calibration(frame.sensors[LIDAR]), self._where(index, "calibrated_sensor"))
-        return ego_to_global, lidar_to_ego
+        return ego_to_global, self._sensor_to_ego(frame.sensors[LIDAR], self._where(index, "calibrated_sensor"))
 
     def _calibration(self, record: Record) -> Record:
         return self._tables.calibrations[record["calibrated_sensor_token"]]
+
+    def _sensor_to_ego(self, record: Record, where: str) -> Float:
+        """Return the pose of a sensor on the car; the same few are asked for in every frame."""
+        token = record["calibrated_sensor_token"]
+        if token not in self._sensor_poses:
+            self._sensor_poses[token] = _pose(self._calibration(record), where)
+        return self._sensor_poses[token]
 
     def instant(self, index: int) -> Instant:
         """Return token, time stamp and pose of frame ``index``, as :meth:`frame` does.
@@ -331,7 +338,7 @@ class NuScenesScene:
             width=int(record["width"]),
             height=int(record["height"]),
             intrinsics=intrinsics,
-            camera_to_ego=ego_to_shifted @ _pose(calibration, where),
+            camera_to_ego=ego_to_shifted @ self._sensor_to_ego(record, where),
         )
 
     def lidar_to_global(self, index: int) -> Float:
