@@ -133,15 +133,16 @@ class TemporalStage:
         return tensors | {f"state.{name}": value for name, value in self._state.tensors().items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Continue from what :meth:`state` returned."""
+        """Continue from what :meth:`state` returned; streams that an older version wrote have forgotten everything."""
 
         def part(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
         self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
         tensors = {name: value.to(self._network.device) for name, value in tensors.items()}
-        self._owners = Owners(**part("owners."))
-        self._state = StreamState.from_tensors(part("state."))
+        if "state.frame" in tensors:
+            self._owners = Owners(**part("owners."))
+            self._state = StreamState.from_tensors(part("state."))
         if self._clips is not None:
             self._clips.plan = self._plan
 

@@ -16,6 +16,7 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import checkpoint
 from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
+from predmapnet.training.run import RunOptions, train
 from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings
 from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
@@ -123,3 +124,25 @@ def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Pat
     (newest / "network.safetensors").write_bytes(b"cut short")
     with pytest.raises(UserError, match="damaged"):
         run(tmp_path / "damaged", scenes, resume=True)
+
+
+def test_streams_of_an_older_version_go_on_without_their_past(tmp_path: Path, scenes: TrainingScenes) -> None:
+    network = PredMapNet(tiny_config())
+    stage = TemporalStage(network, network.make_rig_lookup(scenes.scenes[0].rig), scenes, SETTINGS, tmp_path, Workers())
+    whole = stage.state()
+    older = {name.removeprefix("state."): value for name, value in whole.items() if name.startswith("state.instances.")}
+    older |= {name: value for name, value in whole.items() if name.startswith(("plan.", "owners."))}
+    older |= {"plan.frame": torch.full_like(whole["plan.frame"], 4), "owners.kinds": torch.ones(2, 3).long()}
+    stage.restore(older)
+    assert stage.state()["plan.frame"].tolist() == [4, 4]
+    assert stage.state()["owners.kinds"].shape == (2, 0)
+
+
+def test_a_gpu_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is one")
+    common = {"config": tiny_config(), "data": "demo", "folder": tmp_path / "run", "cache": tmp_path / "cache"}
+    sizes = {"towns": 1, "validation_towns": 1, "processes": 1, "threads": 1}
+    with pytest.raises(UserError, match="no device cuda"):
+        train(RunOptions(**common, **sizes, settings=SETTINGS, device="cuda"))
+    assert not list(tmp_path.iterdir())
