@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from mapfusion.elements import ElementKind
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.ego_motion import move_points
 from predmapnet.network.layers import Perceptron, sine_code, zero_init
+from predmapnet.network.polylines import clip_polylines
 
 FREQUENCIES = 6
 
@@ -31,12 +33,13 @@ class ShortTermFutureGuidance(nn.Module):
         self.fusion = nn.Linear(2 * width, width)
         zero_init(self.fusion)
 
-    def forecast(self, history: Tensor, valid: Tensor, last_step: Tensor) -> Tensor:
+    def forecast(self, history: Tensor, valid: Tensor, labels: Tensor, last_step: Tensor) -> Tensor:
         """Predict the polylines in the ego frame of t + 1 (eq. 10).
 
         Args:
             history: ``(B, T, n, P, 2)``, normalised, oldest first, padded by the oldest one.
             valid: ``(B, T, n) bool``, False in padding.
+            labels: ``(B, T) int64``.
             last_step: ``(B, 2, 3)``, metres: motion of the ground from the ego frame of t - 1 to that of t.
 
         Returns:
@@ -46,8 +49,16 @@ class ShortTermFutureGuidance(nn.Module):
         last = history[:, :, -1]
         motion = (history[:, :, :-1] - last[:, :, None]) * valid[:, :, :-1, None, None]
         seen = torch.cat([10.0 * motion.flatten(2), last.flatten(2) - 0.5, valid.to(last.dtype)], dim=-1)
-        start = move_points(last, last_step, self.roi) if self.steady_motion else last
+        start = self._after_same_step(last, labels, last_step) if self.steady_motion else last
         return start + self.offsets(seen).unflatten(-1, last.shape[-2:]) / 10.0
+
+    def _after_same_step(self, last: Tensor, labels: Tensor, step: Tensor) -> Tensor:
+        """Move polylines as the last step of the car did; what leaves the ROI will not be seen."""
+        if last.shape[1] == 0:
+            return last
+        size = last.new_tensor([self.roi.length, self.roi.width])
+        moved = move_points(last, step, self.roi)
+        return clip_polylines(moved, labels == ElementKind.PED_CROSSING, size)[0]
 
     def forward(self, queries: Tensor, forecasts: Tensor) -> Tensor:
         """Fuse the forecast that was made for this instant into the track queries (eq. 11 and 12).

@@ -297,7 +297,7 @@ class PredMapNet(nn.Module):
         forecasts = instances.points
         if self.future_guidance is not None:
             last_step = last_motion(state, inputs.ego_to_global)
-            forecasts = self.future_guidance.forecast(history, history_valid, last_step)
+            forecasts = self.future_guidance.forecast(history, history_valid, instances.labels, last_step)
         maps, poses, valid = self._remembered_maps(state, outputs.bev, inputs.ego_to_global)
         newest = torch.cat([instances.track_ids, state.next_track_id[:, None] - 1], dim=1).amax(dim=1)
         return StreamState(

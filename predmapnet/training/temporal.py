@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
 from predmapnet.network.image_input import normalise_images
@@ -18,7 +19,7 @@ from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, R
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import instances_from_rows
 from predmapnet.training.batches import TrainingScenes
-from predmapnet.training.losses import forecast_loss, frame_losses
+from predmapnet.training.losses import forecast_loss, forecast_point_loss, frame_losses
 from predmapnet.training.ownership import Chosen, Owners, choose_tracks, owned_truth
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.single_frame import roi_size
@@ -123,7 +124,10 @@ class TemporalStage:
         if self._network.future_guidance is None:
             return state.forecasts.new_zeros(())
         pairs = owned_truth(chosen.owners, chosen.valid, state.forecasts, coming, self._size)
-        loss = forecast_loss(state.forecasts[pairs.frame, pairs.row], coming.points[pairs.truth], self._size)
+        forecasts, truth = state.forecasts[pairs.frame, pairs.row], coming.points[pairs.truth]
+        rings = coming.kinds[pairs.truth] == ElementKind.PED_CROSSING
+        loss = forecast_loss(forecasts, truth, self._size)
+        loss = loss + forecast_point_loss(forecasts, truth, rings, self._size)
         return self._settings.weights.forecast * loss / max(len(pairs), 1)
 
     def state(self) -> dict[str, Tensor]:
