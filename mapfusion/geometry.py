@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -64,7 +63,9 @@ def inverse_pose(a_to_b: Float) -> Float:
 
 
 def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
-    """Cut a line at the ROI and return the parts inside, in the order of the line.
+    """Cut a line at the ROI and return the parts inside, in the order of the line (Liang and Barsky, 1984).
+
+    A line that crosses itself is cut at the border only.
 
     Args:
         points: ``(n, 2)``, metres, ego frame.
@@ -73,9 +74,23 @@ def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
     Returns:
         List of ``(k, 2) float64`` with ``k >= 2``.
     """
-    box = shapely.box(-roi.length / 2, -roi.width / 2, roi.length / 2, roi.width / 2)
-    parts = shapely.get_parts(shapely.intersection(shapely.LineString(points), box))
-    return [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and not part.is_empty]
+    half = roi.size / 2
+    points = points[np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))]
+    start, step = points[:-1], np.diff(points, axis=0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        sides = np.stack([-half - start, half - start]) / step
+    parallel = step == 0.0
+    beside = np.where(np.abs(start) <= half, -np.inf, np.inf)
+    enter = np.where(parallel, beside, sides.min(axis=0)).max(axis=1, initial=0.0)
+    leave = np.where(parallel, np.inf, sides.max(axis=0)).min(axis=1, initial=1.0)
+    inside = np.flatnonzero(enter < leave)
+    breaks = np.flatnonzero((np.diff(inside) > 1) | (leave[inside[:-1]] < 1.0) | (enter[inside[1:]] > 0.0)) + 1
+    parts = []
+    for rows in np.split(inside, breaks) if len(inside) else []:
+        last = start[rows[-1]] + leave[rows[-1]] * step[rows[-1]]
+        part = np.vstack([start[rows] + enter[rows, None] * step[rows], last])
+        parts.append(np.clip(part, -half, half))
+    return parts
 
 
 def chamfer_distance(first: Float, second: Float) -> float:

@@ -107,7 +107,7 @@ def print_towns(folder: Path) -> None:
 
     for split in ("val", "test"):
         found = []
-        for town in mapped_towns(folder / split, split):
+        for town in mapped_towns(folder, split):
             integrator = MapIntegrator(NETWORK_ERRORS)
             for frame in town.frames:
                 integrator.add(frame, town.name)

@@ -15,6 +15,7 @@ from predmapnet.evaluation.global_map import seen_area
 from predmapnet.mapper import Mapper
 from predmapnet.outputs import Outputs
 from predmapnet.pipeline import MappingPipeline
+from predmapnet.weights.files import weights_hash
 
 
 @dataclass(frozen=True)
@@ -28,15 +29,17 @@ class MappedTown:
 
 
 def mapped_towns(folder: Path, split: str) -> Iterator[MappedTown]:
-    """Yield the scenes of a split; frames are read from ``SCENE.parquet`` in a folder, or mapped and written there.
+    """Yield the scenes of a split; frames are read from a folder, or mapped and written there.
 
-    Delete the files when the weights have changed.
+    The files are named after the scene and the weights, ``SCENE-HASH.parquet``: other weights map anew. Delete them
+    when the mapper itself has changed.
     """
     source = DemoSource()
+    weights = weights_hash()[:12]
     pipeline: MappingPipeline | None = None
     folder.mkdir(parents=True, exist_ok=True)
     for info in source.scenes(split):
-        path = folder / f"{info.name}.parquet"
+        path = folder / f"{info.name}-{weights}.parquet"
         if not path.is_file():
             pipeline = pipeline or MappingPipeline(source, Mapper.from_checkpoint())
             pipeline.run(info.name, Outputs(frames=path))
