@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError, model_validator
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
@@ -15,6 +16,19 @@ from predmapnet.errors import UserError
 Positive = Annotated[int, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Metres = Annotated[float, Field(gt=0.0)]
+
+
+def _increasing(values: tuple[float, ...]) -> tuple[float, ...]:
+    if any(far <= near for near, far in pairwise(values)):
+        raise ValueError("should increase")
+    return values
+
+
+Distances = Annotated[tuple[Metres, ...], Field(min_length=1), AfterValidator(_increasing)]
+"""Metres back, the nearest first."""
+
+PILLAR_SAMPLES = 8
+"""Samples of each head per camera and image level (BEVFormer); they take the points of a pillar in turns."""
 
 
 class Section(BaseModel):
@@ -170,7 +184,7 @@ class ResidualBevMemoryConfig(Section):
     kind: Literal["residual"] = "residual"
     enabled: bool = True
     channels: Positive = 16
-    distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
+    distances: Distances = (1.0, 5.0, 10.0, 15.0)
     capacity: Positive = 8
     spacing: Annotated[float, Field(ge=0.0)] = 2.0
 
@@ -184,7 +198,7 @@ class EncoderBevMemoryConfig(Section):
     """
 
     kind: Literal["encoder"] = "encoder"
-    distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
+    distances: Distances = (1.0, 5.0, 10.0, 15.0)
     capacity: Positive = 20
 
 
@@ -250,7 +264,7 @@ class PointDecoderConfig(Section):
     layers: Positive = 4
     point_width: Positive = 64
     sampling_offsets: Positive = 2
-    classes: Positive = 3
+    classes: Literal[3] = 3
 
 
 class MapTrackerDecoderConfig(Section):
@@ -271,8 +285,8 @@ class MapTrackerDecoderConfig(Section):
     layers: Positive = 6
     hidden: Positive = 1024
     dropout: Fraction = 0.1
-    classes: Positive = 3
-    memory_distances: tuple[Metres, ...] = (1.0, 5.0, 10.0, 15.0)
+    classes: Literal[3] = 3
+    memory_distances: Distances = (1.0, 5.0, 10.0, 15.0)
     memory_capacity: Positive = 20
 
 
@@ -407,7 +421,7 @@ class PredMapNetConfig(Section):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
         """Refuse parts that cannot work on each other."""
-        faults = "; ".join(_faults(self))
+        faults = "; ".join((*_faults(self), *_bad_sizes(self)))
         if faults:
             raise ValueError(faults)
         return self
@@ -449,6 +463,24 @@ def _faults(config: PredMapNetConfig) -> Iterator[str]:
     ):
         if on & quirks and not present:
             yield f"quirks without what they are quirks of, {needed}: {', '.join(sorted(on & quirks))}"
+
+
+def _bad_sizes(config: PredMapNetConfig) -> Iterator[str]:
+    """Name the sizes that no layer can be built with."""
+    bev, decoder, depth = config.bev, config.decoder, config.depth
+    if decoder.width % decoder.heads:
+        yield "decoder.width has to be a multiple of decoder.heads"
+    if isinstance(decoder, MapTrackerDecoderConfig) and decoder.width % 4:
+        yield "decoder.width has to be a multiple of 4, for the code of positions"
+    if isinstance(bev, BevFormerConfig):
+        if bev.width % bev.heads or bev.width % 2:
+            yield "bev.width has to be even and a multiple of bev.heads"
+        if PILLAR_SAMPLES % bev.pillar_points:
+            yield f"bev.pillar_points has to divide {PILLAR_SAMPLES}, the samples of each head"
+        if bev.pillar_low >= bev.pillar_high:
+            yield "bev.pillar_low has to be below bev.pillar_high"
+    if depth.near >= depth.far:
+        yield "depth.near has to be less than depth.far"
 
 
 def _maptracker(name: str, image: WholeImageConfig, cameras: tuple[str, ...]) -> PredMapNetConfig:
@@ -534,8 +566,13 @@ def parse_config(text: str | bytes, origin: str) -> PredMapNetConfig:
     try:
         return PredMapNetConfig.model_validate_json(text)
     except ValidationError as error:
-        faults = "; ".join(f"{_place(fault['loc']) or 'file'}: {fault['msg']}" for fault in error.errors())
+        faults = "; ".join(_said(_place(fault["loc"]), fault["msg"]) for fault in error.errors())
         raise UserError(f"the configuration in {origin} does not fit: {faults}") from error
+
+
+def _said(place: str, message: str) -> str:
+    message = message.removeprefix("Value error, ")
+    return f"{place}: {message}" if place else message
 
 
 def _place(location: tuple[int | str, ...]) -> str:

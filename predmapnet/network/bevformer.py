@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import BevFormerConfig, PredMapNetConfig
+from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
 from predmapnet.network.bev_history import look_back
 from predmapnet.network.camera_pillars import CameraPillars, pixel_positions
 from predmapnet.network.deformable_attention import deformable_attention
@@ -81,7 +81,7 @@ class BevSelfAttention(nn.Module):
 class ImageCrossAttention(nn.Module):
     """Deformable attention of the ground cells to the images in which they are seen (spatial cross-attention)."""
 
-    POINTS = 8
+    POINTS = PILLAR_SAMPLES
 
     def __init__(self, config: BevFormerConfig) -> None:
         super().__init__()

@@ -61,9 +61,9 @@ def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
         raise UserError(f"There is no file {path}.")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except pickle.UnpicklingError:
         if _beginning(path) in BEGINNINGS:
-            raise UserError(_not_only_tensors(path, error)) from None
+            raise UserError(_not_only_tensors(path)) from None
         raise UserError(f"{path} is not a whole PyTorch checkpoint. Fetch it again.") from None
     except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
         raise UserError(f"{path} is not a whole PyTorch checkpoint ({_first_line(error)}). Fetch it again.") from None
@@ -92,12 +92,12 @@ def import_maptracker(
             the configuration is not one of MapTracker's baseline.
     """
     report, found = ImportReport(), {}
-    unknown, faults = [], []
+    unknown, differing = [], []
     for name, tensor in official.items():
         here, original = name_here(name), original_of_alias(name)
         if original is not None:
             if original not in official or not torch.equal(tensor, official[original]):
-                faults.append(f"{name} differs from {original}, although all layers share one branch")
+                differing.append(f"{name} differs from {original}")
             report.ignored[name] = f"repeats {original}"
         elif here is not None:
             found[here] = tensor
@@ -106,8 +106,9 @@ def import_maptracker(
             report.ignored[name] = "a constant that follows from the configuration; it was compared"
         else:
             unknown.append(name)
-    if unknown:
-        faults.append(f"{len(unknown)} unknown: {_some(unknown)}")
+    faults = [f"{len(unknown)} unknown: {_some(unknown)}"] if unknown else []
+    if differing:
+        faults.append(f"{len(differing)} of a branch that all layers share are not the same: {_some(differing)}")
     config = _configuration(official, found, config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -189,11 +190,11 @@ def _close(first: Tensor, second: Tensor) -> bool:
     return first.shape == second.shape and torch.allclose(first.double(), second.double(), rtol=0.0, atol=1e-4)
 
 
-def _not_only_tensors(path: Path, error: Exception) -> str:
+def _not_only_tensors(path: Path) -> str:
+    # Not torch's own words: they recommend to read the file in the way that executes it.
     return (
         f"{path} holds more than tensors and plain values; reading the rest would execute code from the file, which is "
-        f"not done ({_first_line(error)}). If you trust its source, write its 'state_dict' alone to a new file with "
-        "the program that made it."
+        "not done. If you trust its source, write its 'state_dict' alone to a new file with the program that made it."
     )
 
 

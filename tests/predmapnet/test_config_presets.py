@@ -1,5 +1,7 @@
 """The configuration: presets, files, and what is refused."""
 
+import json
+
 import pytest
 from pydantic import ValidationError
 
@@ -57,6 +59,27 @@ def test_parts_that_do_not_fit_together_are_refused(sections, words):
     values = preset("maptracker-nuscenes").model_dump()
     with pytest.raises(ValidationError, match=words):
         PredMapNetConfig.model_validate({**values, **sections})
+
+
+@pytest.mark.parametrize(
+    ("section", "values", "words"),
+    [
+        ("decoder", {"heads": 5}, "decoder.width has to be a multiple of decoder.heads"),
+        ("decoder", {"width": 30, "heads": 3}, "decoder.width has to be a multiple of 4"),
+        ("decoder", {"classes": 4}, "Input should be 3"),
+        ("decoder", {"memory_distances": [5.0, 1.0]}, "memory_distances: should increase"),
+        ("bev", {"heads": 5}, "bev.width has to be even and a multiple of bev.heads"),
+        ("bev", {"pillar_points": 3}, "bev.pillar_points has to divide 8"),
+        ("bev", {"pillar_low": 5.0}, "bev.pillar_low has to be below bev.pillar_high"),
+        ("temporal_bev", {"distances": []}, "temporal_bev.distances: Tuple should have at least 1"),
+        ("depth", {"near": 40.0}, "depth.near has to be less than depth.far"),
+    ],
+)
+def test_sizes_that_no_network_can_have_are_refused_before_it_is_built(section, values, words):
+    config = json.loads(preset("paper-nuscenes").to_json())
+    config[section] |= values
+    with pytest.raises(UserError, match=words):
+        parse_config(json.dumps(config), "here")
 
 
 def test_quirks_of_other_parts_are_refused():
