@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Scheme, SplitScheme, Weights
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, PrecisionOption, Scheme, SplitScheme, Weights
+from predmapnet.precision import Precision
 
 
 def batch(
@@ -24,6 +25,7 @@ def batch(
     split_scheme: SplitScheme = Scheme.OLD,
     weights: Weights = None,
     device: Device = "auto",
+    precision: PrecisionOption = Precision.FLOAT32,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
     """Map many scenes with several processes; run it again to resume where it stopped.
@@ -53,6 +55,7 @@ def batch(
         recordings,
         save_frames,
         threads=max(1, available_cores() // jobs),
+        precision=precision,
     )
     journal = BatchJournal(out)
     with progress_display() as display:

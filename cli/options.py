@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from predmapnet.precision import Precision
+
 
 class Scheme(StrEnum):
     """Ways to divide a data set into training and validation."""
@@ -40,6 +42,14 @@ Weights = Annotated[
     Path | None, typer.Option(help="Checkpoint (safetensors). By default the one that comes with PredMapNet.")
 ]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
+PrecisionOption = Annotated[
+    Precision,
+    typer.Option(
+        "--precision",
+        help="Of the image backbone and the BEV encoder. bfloat16 is for a GPU or a CPU that calculates with it; on "
+        "others float32 is faster. Everything else stays in float32.",
+    ),
+]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
 AllowMissingCameras = Annotated[
     bool, typer.Option("--allow-missing-cameras", help="Go on where a camera has no image, instead of stopping.")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, Threads, Weights
+from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
+from predmapnet.precision import Precision
 
 
 def view(
@@ -21,6 +22,7 @@ def view(
     data_root: DataRoot = None,
     weights: Weights = None,
     device: Device = "auto",
+    precision: PrecisionOption = Precision.FLOAT32,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
@@ -46,7 +48,7 @@ def view(
         use_threads(threads)
         from predmapnet.pipeline import MappingPipeline
 
-        pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras)
+        pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras, precision)
         err.print(pipeline.sentence, markup=False)
         warn_of_weights(pipeline)
         with progress_display() as display:

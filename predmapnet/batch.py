@@ -28,6 +28,7 @@ import predmapnet
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_whole
 from predmapnet.outputs import Outputs
+from predmapnet.precision import Precision
 from predmapnet.threads import end_with_parent, use_threads
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class BatchSettings:
 
     Attributes:
         dataset, data_root: name and folder of the source that was opened.
-        weights, device: as for a single scene.
+        weights, device, precision: as for a single scene.
         allow_missing_cameras: go on where a camera has no image.
         recordings, frames: write these files too.
         threads: CPU threads of each process.
@@ -55,6 +56,7 @@ class BatchSettings:
     recordings: bool = False
     frames: bool = False
     threads: int = 1
+    precision: Precision = Precision.FLOAT32
 
     def outputs(self, scene: str, folder: Path) -> Outputs:
         """Name the files of one scene."""
@@ -143,6 +145,7 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
         settings.dataset,
         str(settings.data_root),
         settings.allow_missing_cameras,
+        settings.precision,
     ]
     return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 
@@ -281,6 +284,11 @@ def _worker_pipeline(settings: BatchSettings) -> MappingPipeline:
         from predmapnet.pipeline import MappingPipeline
 
         _pipeline = MappingPipeline.from_settings(
-            settings.dataset, settings.data_root, settings.weights, settings.device, settings.allow_missing_cameras
+            settings.dataset,
+            settings.data_root,
+            settings.weights,
+            settings.device,
+            settings.allow_missing_cameras,
+            settings.precision,
         )
     return _pipeline

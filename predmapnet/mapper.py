@@ -20,9 +20,11 @@ from predmapnet.errors import UserError
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.inference import for_inference
 from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
+from predmapnet.network.low_precision import in_precision
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.rig_geometry import arranged_rig
 from predmapnet.network.tracking import select
+from predmapnet.precision import Precision
 from predmapnet.weights.checkpoint import load_checkpoint
 
 RIG_TOLERANCE = 1e-4
@@ -59,6 +61,7 @@ class Mapper:
         config: of the network.
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
         facts: what the weights file tells of its training (:class:`predmapnet.weights.checkpoint.Checkpoint`).
+        precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.low_precision`).
     """
 
     def __init__(
@@ -67,27 +70,32 @@ class Mapper:
         device: str | torch.device = "cpu",
         weights_sha256: str = "",
         facts: Mapping[str, Any] | None = None,
+        precision: Precision = Precision.FLOAT32,
     ) -> None:
-        self.network = for_inference(network).to(device)
+        self.network = in_precision(for_inference(network).to(device), precision)
         self.config: PredMapNetConfig = network.config
         self.weights_sha256 = weights_sha256
         self.facts: Mapping[str, Any] = dict(facts or {})
+        self.precision = precision
         self._device = torch.device(device)
         self._lookups: list[tuple[Rig, RigGeometry]] = []
 
     @classmethod
-    def from_checkpoint(cls, path: Path | None = None, device: str = "auto") -> Mapper:
+    def from_checkpoint(
+        cls, path: Path | None = None, device: str = "auto", precision: Precision = Precision.FLOAT32
+    ) -> Mapper:
         """Load a network.
 
         Args:
             path: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
             device: ``auto`` (a GPU if there is one), or as torch calls it.
+            precision: of the image backbone and the BEV encoder.
 
         Raises:
             UserError: the weights or the device are not there.
         """
         checkpoint = load_checkpoint(path)
-        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts)
+        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts, precision)
 
     @property
     def roi(self) -> RegionOfInterest:

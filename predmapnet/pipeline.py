@@ -27,6 +27,7 @@ from predmapnet.evaluation.frames_io import FrameWriter
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.mapper import Mapper
 from predmapnet.outputs import Outputs
+from predmapnet.precision import Precision
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
 from predmapnet.streaming import MapSnapshot, Observer, SceneRun, Step, map_scene
 
@@ -121,6 +122,7 @@ class MappingPipeline:
         weights: Path | None = None,
         device: str = "auto",
         allow_missing_cameras: bool = False,
+        precision: Precision = Precision.FLOAT32,
     ) -> MappingPipeline:
         """Choose the source and load the network, as the options of the commands say.
 
@@ -128,7 +130,7 @@ class MappingPipeline:
             UserError: what was asked for is missing or broken.
         """
         source, sentence = open_source(dataset, data_root)
-        return cls(source, Mapper.from_checkpoint(weights, device=device), sentence, allow_missing_cameras)
+        return cls(source, Mapper.from_checkpoint(weights, device, precision), sentence, allow_missing_cameras)
 
     def run(
         self,
@@ -192,6 +194,7 @@ class MappingPipeline:
             "synthetic": self.source.synthetic,
             "configuration": self.mapper.config.model_dump(mode="json"),
             "weights_sha256": self.mapper.weights_sha256,
+            "precision": self.mapper.precision.value,
             "seed": SEED,
         }
         if self.note:

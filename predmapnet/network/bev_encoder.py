@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from predmapnet.config import LookupBevConfig
 from predmapnet.network.interface import FrameInputs, RigGeometry, StreamState
-from predmapnet.network.layers import ConvNorm, ResidualBlock
+from predmapnet.network.layers import ConvNorm, Convolution, ResidualBlock
 from predmapnet.network.view_transform import RigLookup, to_ground
 
 
@@ -20,7 +20,7 @@ class BevEncoder(nn.Module):
     def __init__(self, channels_in: int, config: LookupBevConfig) -> None:
         super().__init__()
         fine, middle, coarse = config.widths
-        self.reduce = nn.Conv2d(channels_in, fine, 2, stride=2, bias=False)
+        self.reduce = Convolution(channels_in, fine, 2, stride=2, bias=False)
         self.position = nn.Parameter(torch.randn(fine, config.rows, config.columns) * 0.02)
         self.norm = nn.BatchNorm2d(fine)
         self.fine_in = ResidualBlock(fine, fine)

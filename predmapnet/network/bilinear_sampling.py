@@ -45,7 +45,7 @@ def _neighbours(position: Tensor, size: Tensor | int) -> tuple[Tensor, Tensor]:
 
 
 def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-    """Add up rows of a table.
+    """Add up rows of a table, in the precision of the weights.
 
     Args:
         table: ``(rows, C)``.
@@ -55,4 +55,4 @@ def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
     Returns:
         ``(results, C)``.
     """
-    return F.embedding_bag(indices, table, per_sample_weights=weights.to(table.dtype), mode="sum")
+    return F.embedding_bag(indices, table.to(weights.dtype), per_sample_weights=weights, mode="sum")

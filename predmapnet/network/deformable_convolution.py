@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.network.bilinear_sampling import bilinear_corners, weighted_rows
+from predmapnet.network.layers import Convolution
 from predmapnet.network.matrix_product import linear
 
 TAPS = 9
@@ -23,7 +24,7 @@ class DeformableConvolution(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(channels_out, channels_in, 3, 3))
         self.register_parameter("bias", None)
-        self.offsets = nn.Conv2d(channels_in, 3 * TAPS, 3, padding=1)
+        self.offsets = Convolution(channels_in, 3 * TAPS, 3, padding=1)
         nn.init.kaiming_uniform_(self.weight, nonlinearity="relu")
         nn.init.zeros_(self.offsets.weight)
         assert self.offsets.bias is not None

@@ -23,10 +23,10 @@ def for_inference(network: Network) -> Network:
     for module in copied.modules():
         if isinstance(module, NormalisedConvolution | DeformableUnit):
             _fold(module.convolution, module.norm)
-            module.norm = nn.Identity()
+            module.norm = nn.Identity().eval()
         elif isinstance(module, ConvNorm):
             _fold(module[0], module[1])
-            module[1] = nn.Identity()
+            module[1] = nn.Identity().eval()
     return copied
 
 

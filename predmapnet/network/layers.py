@@ -97,6 +97,14 @@ class Pointwise(Linear):
         return super().forward(features.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
+class Convolution(nn.Conv2d):
+    """A convolution in the precision of its weights."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map ``(B, C_in, h, w)`` to ``(B, C_out, h / stride, w / stride)``."""
+        return super().forward(features.to(self.weight.dtype))
+
+
 class ConvNorm(nn.Sequential):
     """Convolution without bias and batch norm; ReLU if asked for."""
 
@@ -105,7 +113,7 @@ class ConvNorm(nn.Sequential):
         convolution = (
             Pointwise(channels_in, channels_out, bias=False)
             if plain
-            else nn.Conv2d(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False)
+            else Convolution(channels_in, channels_out, kernel, stride, (kernel - 1) // 2, bias=False)
         )
         super().__init__(convolution, nn.BatchNorm2d(channels_out))
         if relu:

@@ -14,7 +14,7 @@ SMALLEST_BATCH = 16
 
 
 def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Compute what ``F.linear`` computes.
+    """Compute what ``F.linear`` computes, in the precision of the weight.
 
     On a CPU, torch multiplies matrices by MKL, which runs at less than half the machine's rate unless Intel made it,
     and convolutions by oneDNN, which does not. So many rows are put as the pixels of a 1x1 convolution.
@@ -27,6 +27,7 @@ def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor
     Returns:
         ``(..., C_out)``.
     """
+    tokens = tokens.to(weight.dtype)
     rows = tokens.numel() // weight.shape[1]
     batch = _divisor(rows) if rows >= MANY_ROWS and tokens.device.type == "cpu" else None
     if batch is None or not torch.backends.mkldnn.is_available():

@@ -30,7 +30,7 @@ class NormalisedConvolution(nn.Module):
             kernel, shift = with_norm(kernel, norm)
         if convolution.kernel_size == (1, 1) and convolution.stride == (1, 1):
             return linear(features.permute(0, 2, 3, 1), kernel.flatten(1), shift).permute(0, 3, 1, 2)
-        return F.conv2d(features, kernel, shift, convolution.stride, convolution.padding)
+        return F.conv2d(features.to(kernel.dtype), kernel, shift, convolution.stride, convolution.padding)
 
 
 def with_norm(kernel: Tensor, norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:

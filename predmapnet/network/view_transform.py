@@ -160,7 +160,7 @@ def to_ground(features: Tensor, camera_valid: Tensor, lookup: RigLookup) -> Tens
     """
     batch = len(features)
     features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
-    pixels = features.permute(0, 1, 3, 4, 2).reshape(batch, -1, features.shape[2])
+    pixels = features.permute(0, 1, 3, 4, 2).reshape(batch, -1, features.shape[2]).to(lookup.gather.weights.dtype)
     summed = _SparseProduct.apply(pixels, lookup)  # type: ignore[no-untyped-call]
     cameras = camera_valid.to(summed.dtype) @ lookup.visible.to(summed.dtype).T
     ground = summed / cameras.clamp(min=1.0)[..., None]

@@ -56,12 +56,21 @@ def test_a_scene_becomes_a_map_a_recording_and_a_table_of_frames(infer, tmp_path
     assert provenance["dataset"] == "nuscenes"
     assert provenance["synthetic"] is False
     assert len(provenance["weights_sha256"]) == 64
+    assert provenance["precision"] == "float32"
     assert str(tmp_path) not in json.dumps(provenance)
     assert pq.read_table(tmp_path / "f.parquet").num_rows == 3
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "r.rrd").stream()}
     assert {"/world/ego_vehicle", "/world/ego_vehicle/CAM_FRONT", "/world/ego_vehicle/tracks/divider"} <= entities
     assert any(entity.startswith("/world/map/") for entity in entities)
     assert leftovers(tmp_path) == []
+
+
+def test_a_map_in_bfloat16_says_so(infer, tmp_path):
+    result = infer("scene-0001", "--out", "map.geojson", "--precision", "bfloat16")
+    assert result.code == 0, result.err
+    found = read_map(tmp_path / "map.geojson")
+    assert found.provenance["precision"] == "bfloat16"
+    assert infer("scene-0001", "--out", "map.geojson", "--precision", "int4").code == 2
 
 
 def test_weights_of_maptrackers_kind_map_a_scene_too(predmapnet, tiny_root, tmp_path):
