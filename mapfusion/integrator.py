@@ -10,12 +10,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.assembly import Assembly
 from mapfusion.association import Candidate, assign, candidates, gather
 from mapfusion.cleaning import line_elements, ring_elements
 from mapfusion.config import IntegratorConfig
 from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
-from mapfusion.joining import Ends, all_ends, ends_of, join
 from mapfusion.journal import Journal
 from mapfusion.lines import Evidence, FusedLine, beside, fuse
 from mapfusion.observations import Observation, Track, observe, pose_problem
@@ -71,9 +71,9 @@ class MapIntegrator:
         self.frames = 0
         self.errors = ErrorModel()
         self._parts = PRIOR_SHARES
-        self._clean: dict[int, tuple[list[MapElement], Ends]] = {}
         self._dirty: set[int] = set()
-        self._joined: tuple[MapElement, ...] = ()
+        self._assembly = Assembly()
+        self._elements: tuple[MapElement, ...] = ()
 
     def add(self, frame_map: FrameMap, log: str = "") -> None:
         """Fuse the tracked elements of one frame.
@@ -103,16 +103,17 @@ class MapIntegrator:
         instant = _Instant(frame_map.timestamp, (float(car[0]), float(car[1])), car - reach, car + reach)
         near = self.index.near(instant.low, instant.high)
         self._dirty.update(near)
+        self._assembly.looked_at(instant.low, instant.high, self.config)
         for kind in (ElementKind.DIVIDER, ElementKind.BOUNDARY):
             known = {i: self.lines[i] for i in near if i in self.lines and self.lines[i].kind is kind}
             self._add_lines([o for o in lines if o.kind is kind], known, instant)
         self._add_rings(rings, [i for i in near if i in self.rings], frame_map, visible)
 
     def map(self) -> GlobalMap:
-        """Return the map as it stands; only what changed since the last call is computed, and which lines join."""
+        """Return the map as it stands; only what changed since the last call is computed."""
         if self._dirty:
             self._refresh()
-        return GlobalMap(self._joined, {"frames": self.frames, "integrator": asdict(self.config)})
+        return GlobalMap(self._elements, {"frames": self.frames, "integrator": asdict(self.config)})
 
     def _refresh(self) -> None:
         parts = self.errors.parts()
@@ -127,14 +128,9 @@ class MapIntegrator:
                 found = ring_elements(self.rings[element], self.views, self._parts, self.config, logs)
             else:
                 found = []
-            if found:
-                self._clean[element] = found, ends_of(found)
-            else:
-                self._clean.pop(element, None)
+            self._assembly.put(element, found)
         self._dirty.clear()
-        pieces = [self._clean[key] for key in sorted(self._clean)]
-        elements = [element for found, _ in pieces for element in found]
-        self._joined = tuple(join(elements, self.views, self.config, all_ends(pieces)))
+        self._elements = self._assembly.elements(self.views, self.config)
 
     def save(self, path: Path) -> None:
         """Write the state to a ``.npz`` file, to go on later with :meth:`load`; raises OSError."""

@@ -37,7 +37,7 @@ SAME_PLACE = 0.3
 
 
 @dataclass(frozen=True)
-class _Link:
+class Link:
     """Two ends that may be one line.
 
     Attributes:
@@ -102,25 +102,18 @@ def all_ends(pieces: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
     return Ends(element + np.repeat(before[:-1], counts), end, kind, tip, outward)
 
 
-def join(
-    elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig, ends: Ends | None = None
-) -> list[MapElement]:
+def join(elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
     """Join the lines that go on in each other; crossings and closed lines stay as they are.
 
     Args:
         elements: of one map, metres.
         views: where the car has looked.
         config: how far apart, and how well in line, ends must be.
-        ends: of the elements, if they are known.
 
     Returns:
         The elements, in the order of the first piece of each.
     """
-    ends = ends_of(elements) if ends is None else ends
-    if len(ends.tip) < 2:
-        return list(elements)
-    links = _links(elements, ends, views, config)
-    return _chained(list(elements), sorted(links, key=lambda link: (link.cost, link.ends))) if links else list(elements)
+    return [element for _, element in chained(elements, links_between(elements, ends_of(elements), views, config))]
 
 
 def _direction(points: Float, end: int) -> Float:
@@ -133,8 +126,10 @@ def _direction(points: Float, end: int) -> Float:
     return np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
 
 
-def _links(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, config: IntegratorConfig) -> list[_Link]:
-    """Return the pairs of ends that go on in each other."""
+def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, config: IntegratorConfig) -> list[Link]:
+    """Return the pairs of ends that go on in each other, the best first."""
+    if len(ends.tip) < 2:
+        return []
     first, second = cKDTree(ends.tip).query_pairs(config.join_gap, output_type="ndarray").T
     against = -(ends.outward[first] * ends.outward[second]).sum(axis=1)
     keep = (ends.kind[first] == ends.kind[second]) & (against > np.cos(np.radians(config.join_angle)))
@@ -156,34 +151,38 @@ def _links(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, config: 
             share = np.linspace(0.0, 1.0, int(ahead) + 2)[1:-1, None]
             if float(np.median(views.at(ends.tip[first[row]] + share * gap[row]))) > config.join_views:
                 continue
-        links.append(_Link(abs(ahead) + 2.0 * float(aside[row]), (one, two), max(-ahead, 0.0)))
-    return links
+        links.append(Link(abs(ahead) + 2.0 * float(aside[row]), (one, two), max(-ahead, 0.0)))
+    return sorted(links, key=lambda link: (link.cost, link.ends))
 
 
-def _chained(elements: list[MapElement], links: Sequence[_Link]) -> list[MapElement]:
-    """Join along links, each end once, the best first."""
-    at: dict[End, End] = {(number, end): (number, end) for number in range(len(elements)) for end in (0, -1)}
+def chained(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
+    """Join along links, each end once, in their order.
+
+    Returns:
+        The number of the first piece of each element, ascending, and the element.
+    """
     parts: dict[int, MapElement] = dict(enumerate(elements))
+    used: set[End] = set()
+    # where the outer ends of joined pieces are now, and the way back
+    at: dict[End, End] = {}
+    was: dict[End, End] = {}
     for link in links:
-        first, second = link.ends
-        if first not in at or second not in at:
+        if not used.isdisjoint(link.ends):
             continue
-        (one, end), (two, start) = at.pop(first), at.pop(second)
+        used.update(link.ends)
+        (one, end), (two, start) = (at.get(outer, outer) for outer in link.ends)
         if one == two:
             parts[one] = _closed(parts[one])
             continue
         before = parts[one] if end == -1 else _reversed(parts[one])
         after = parts[two] if start == 0 else _reversed(parts[two])
         keep, drop = min(one, two), max(one, two)
-        joined = _joined(before, after, link.overlap)
         del parts[drop]
-        parts[keep] = joined
-        for key, (part, other_end) in list(at.items()):
-            if part == one and other_end != end:
-                at[key] = (keep, 0)
-            elif part == two and other_end != start:
-                at[key] = (keep, -1)
-    return [parts[number] for number in sorted(parts)]
+        parts[keep] = _joined(before, after, link.overlap)
+        outer_ends = [was.get(other, other) for other in ((one, -1 - end), (two, -1 - start))]
+        for outer, now in zip(outer_ends, ((keep, 0), (keep, -1)), strict=True):
+            at[outer], was[now] = now, outer
+    return sorted(parts.items())
 
 
 def _reversed(element: MapElement) -> MapElement:

@@ -25,7 +25,7 @@ class TileIndex:
     def put(self, element: int, points: Float) -> None:
         """File an element under the tiles of its points ``(n, 2)``, replacing what was known of it."""
         tiles = set(_key(np.floor(points / TILE_SIZE).astype(np.int64)).tolist())
-        known = self._tiles.get(element, set())
+        known = self._tiles.setdefault(element, set())
         if tiles == known:
             return
         for tile in known - tiles:
@@ -53,6 +53,15 @@ class TileIndex:
         keys = _key(np.stack([x.ravel(), y.ravel()], axis=1)).tolist()
         found: set[int] = set().union(*(self._elements.get(key, ()) for key in keys))
         return sorted(found)
+
+    def around(self, points: Float, reach: float) -> set[int]:
+        """Return the ids with a point in a tile that is no farther than ``reach`` from one of ``(n, 2)`` points.
+
+        ``reach`` is at most half of a tile's side; it is measured along x and along y.
+        """
+        corners = [points + np.array([x, y]) for x in (-reach, reach) for y in (-reach, reach)]
+        tiles = set(_key(np.floor(np.concatenate(corners) / TILE_SIZE).astype(np.int64)).tolist())
+        return set().union(*(self._elements.get(tile, ()) for tile in tiles))
 
     def _leave(self, tile: int, element: int) -> None:
         members = self._elements[tile]

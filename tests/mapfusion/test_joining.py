@@ -17,7 +17,7 @@ from mapfusion.tidy import hairpins
 from mapfusion.views import ViewGrid
 from mapfusion.visibility import CameraSector, visible_ground
 from tests.mapfusion.map_quality import dense, faults, nearest
-from tests.mapfusion.simulation import ROI, pose
+from tests.mapfusion.simulation import ROI, pose, town_drive
 from tests.mapfusion.test_integrator_properties import frame_map, integrate
 
 CONFIG = IntegratorConfig()
@@ -88,6 +88,35 @@ def test_a_gap_is_closed_unless_it_was_looked_at():
     one, two = line([[-20, 0], [-3, 0]]), line([[3, 0], [20, 0]])
     assert len(joined(one, two)) == 1
     assert len(joined(one, two, looked=8)) == 2
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_maps_made_on_the_way_change_nothing(seed):
+    """What is joined, cut and left out around each change is what one look at the whole map would give."""
+    watched, alone = MapIntegrator(), MapIntegrator()
+    drive = town_drive(seed)
+    for number, frame in enumerate([*drive.frames, *town_drive(seed + 1).frames]):
+        log = str(number // len(drive.frames))
+        watched.add(frame, log)
+        alone.add(frame, log)
+        if number % 3 == 0:
+            watched.map()
+    for one, other in zip(watched.map(), alone.map(), strict=True):
+        np.testing.assert_array_equal(one.points, other.points)
+        assert (one.kind, one.confidence, one.origins) == (other.kind, other.confidence, other.origins)
+
+
+def test_a_gap_that_is_looked_at_later_parts_what_was_joined():
+    sides = [np.array([[-30.0, 0.0], [-3.0, 0.0]]), np.array([[3.0, 0.0], [30.0, 0.0]])]
+    integrator = MapIntegrator()
+    for number in range(8):
+        for side, x in enumerate((-33.0, 33.0)):
+            seen = frame_map([sides[side] - [x, 0.0]], number=number, ego_to_global=pose(x, 0.0, 0.0))
+            integrator.add(seen, log=f"side {side}")
+    assert len(integrator.map()) == 1
+    for number in range(8):
+        integrator.add(frame_map(sides, number=number), log="between")
+    assert len(integrator.map()) == 2
 
 
 def test_a_loop_of_two_pieces_is_closed():
