@@ -66,12 +66,12 @@ def _table(found: MapDiff) -> Table:
     from mapfusion.elements import ElementKind
 
     table = Table(show_edge=False, pad_edge=False)
-    table.add_column("")
+    table.add_column("metres (pieces)", no_wrap=True)
     for change in Change:
-        table.add_column(f"{change.value} (m)", justify="right")
-    table.add_column("median move (m)", justify="right")
+        table.add_column(change.value, justify="right", no_wrap=True)
+    table.add_column("by", justify="right", no_wrap=True)
     for kind in ElementKind:
         cells = [f"{found.metres(change, kind):.0f} ({found.count(change, kind)})" for change in Change]
         moved = found.moved_by(kind)
-        table.add_row(kind.label, *cells, "" if moved != moved else f"{moved:.2f}")
+        table.add_row(kind.label, *cells, "" if moved != moved else f"{moved:.2f} m")
     return table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.coverage import coverage, inside
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.export.geojson import DECIMALS, Georeference, InvertibleGeoreference
+from mapfusion.export.geojson import DECIMALS, Georeference, InvertibleGeoreference, write_whole
 from mapfusion.geometry import arc_length
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
 
@@ -164,12 +163,8 @@ def write_diff(
     """
     features = [_feature(item, georeference) for item in difference.differences]
     document = {"type": "FeatureCollection", "predmapnet": provenance or {}, "features": features}
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
+    with write_whole(path) as temporary:
         temporary.write_text(json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _feature(item: Difference, georeference: Georeference) -> dict[str, Any]:

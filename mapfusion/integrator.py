@@ -86,15 +86,15 @@ class MapIntegrator:
             log: name of the drive; poses are checked against other frames of the same drive only, and equal track
                 ids of two drives are two tracks.
         """
-        car = frame_map.ego_to_global[:2, 3]
         problem = (
             pose_problem(frame_map.ego_to_global)
             or ground_problem(frame_map)
-            or self.journal.enter(log, frame_map.timestamp, car, self.config.max_speed)
+            or self.journal.enter(log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed)
         )
         if problem is not None:
             self.rejections[problem] += 1
             return
+        car = frame_map.ego_to_global[:2, 3]
         visible = clearly_visible(frame_map)
         lines, rings = observe(frame_map, self.config, self.rejections, self.journal.book(log).number, visible)
         self.frames += 1

@@ -42,6 +42,9 @@ def write_map(
 ) -> None:
     """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
 
+    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.01 mm, deviations to
+    1 mm and confidences to 0.0001. Rings turn counter-clockwise. :func:`read_map` gives it back.
+
     Args:
         global_map: elements in the metric global frame.
         path: file to write; an existing one is replaced.
@@ -161,6 +164,8 @@ def read_box(path: Path) -> Float | None:
         return None
     if len(box) != 4 or not np.isfinite(box).all():
         raise ValueError(f"{path}: the bounding box is not four numbers: {box}")
+    if not (np.abs(box) <= [180.0, 90.0, 180.0, 90.0]).all():
+        raise ValueError(f"{path}: the positions are not longitude and latitude in degrees (WGS84): {box}")
     return np.array(box, dtype=np.float64)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapfusion.config import IntegratorConfig
 from mapfusion.curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, Curve
 from mapfusion.elements import ElementKind, FrameMap
-from mapfusion.geometry import transform_points
+from mapfusion.geometry import clip_line, transform_points
 from mapfusion.matching import tangents_of_all
 from mapfusion.uncertainty import place_mark, track_mark
 from mapfusion.views import view_weight
@@ -108,7 +108,7 @@ def observe(
         ring = int(frame_map.kinds[row]) == ElementKind.PED_CROSSING
         (left, rear), (right, front) = extent
         within = max(-left, right) <= half[0] and max(-rear, front) <= half[1]
-        pieces = _ring_pieces(points, box, within) if ring else _line_pieces(points, box, within)
+        pieces = _ring_pieces(points, box, within) if ring else [points] if within else clip_line(points, frame_map.roi)
         if not pieces:
             rejections["ring without area" if ring else "outside the region of interest"] += 1
         (rings if ring else lines).extend(pieces)
@@ -203,19 +203,14 @@ def _element_problem(
     if not 0.0 <= score <= 1.0:
         return "score outside [0, 1]"
     if not _well_formed(points, config):
-        return "too many points" if points.ndim == 2 and len(points) > config.max_points else "fewer than two points"
+        if points.ndim != 2 or points.shape[1] != 2:
+            return "points are not (n, 2)"
+        return "fewer than two points" if len(points) < 2 else "too many points"
     if not all(math.isfinite(value) for corner in extent for value in corner):
         return "points not finite"
     if extent[0] == extent[1]:
         return "line without length"
     return None
-
-
-def _line_pieces(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:
-    if within:
-        return [points]
-    inside = shapely.line_merge(shapely.intersection(shapely.LineString(points), box))
-    return [shapely.get_coordinates(part) for part in shapely.get_parts(inside) if part.geom_type == "LineString"]
 
 
 def _ring_pieces(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:

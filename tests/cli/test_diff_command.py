@@ -28,6 +28,7 @@ def test_the_table_and_the_file_say_what_changed(predmapnet, tmp_path):
     result = predmapnet("diff", old, new, "--out", "diff.geojson")
     assert result.code == 0, result.err
     assert "80 (1)" in result.out
+    assert "unobserved" in result.out
     features = json.loads((tmp_path / "diff.geojson").read_text())["features"]
     found = {(f["properties"]["change"], f["properties"]["kind"]): f["properties"] for f in features}
     assert abs(found["removed", "divider"]["length_m"] - 80) < 1
@@ -38,7 +39,10 @@ def test_mistakes_are_one_message(predmapnet, tmp_path):
     here = write(tmp_path / "here.geojson", line([[0, 0], [50, 0]]))
     far = write(tmp_path / "far.geojson", line([[0, 0], [50, 0]]), plane=LocalPlane(-71.0, 42.3))
     (tmp_path / "broken.geojson").write_text('{"type": "FeatureCollection", "features": [{"type": "Feature"}]}')
+    projected = (tmp_path / "here.geojson").read_text().replace("[8.4", "[508.4")
+    (tmp_path / "projected.geojson").write_text(projected)
     for arguments, message in (
+        ((here, tmp_path / "projected.geojson"), "not longitude and latitude"),
         ((here, far), "not of one city"),
         ((here, tmp_path / "broken.geojson"), "feature 0"),
         ((here, tmp_path / "none.geojson"), "no such file"),

@@ -47,6 +47,15 @@ def test_clipped_parts_lie_inside_and_are_no_longer_than_the_line(points):
     assert sum(arc_length(part)[-1] for part in parts) <= arc_length(points)[-1] + 1e-6
 
 
+def test_a_line_that_folds_back_or_crosses_itself_is_cut_at_the_border_only():
+    there_and_back = np.array([[0.0, 0.0], [1.0, 16.0], [0.0, 0.0]])
+    lengths = [arc_length(part)[-1] for part in clip_line(there_and_back, RegionOfInterest())]
+    assert lengths == pytest.approx([np.hypot(15.0, 0.9375)] * 2)
+    bow = np.array([[0.0, 0.0], [10.0, 10.0], [0.0, 10.0], [10.0, 0.0], [40.0, 0.0]])
+    (part,) = clip_line(bow, RegionOfInterest())
+    np.testing.assert_allclose(part, [[0, 0], [10, 10], [0, 10], [10, 0], [30, 0]])
+
+
 @given(lines, lines)
 def test_chamfer_distance_is_symmetric_and_zero_for_the_same_points(first, second):
     assert chamfer_distance(first, second) == pytest.approx(chamfer_distance(second, first))
