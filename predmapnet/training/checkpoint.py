@@ -81,6 +81,14 @@ def latest(folder: Path) -> Path | None:
     return max(folder.glob(f"{PREFIX}*"), default=None)
 
 
+def to_resume(folder: Path) -> Path:
+    """Return the newest complete checkpoint below ``folder``. Raises UserError if there is none."""
+    newest = latest(folder)
+    if newest is None:
+        raise UserError(f"There is no checkpoint in {folder} to resume from. Start without --resume.")
+    return newest
+
+
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Write JSON, readable by a person."""
     path.write_bytes(orjson.dumps(value, option=orjson.OPT_INDENT_2))
@@ -103,6 +111,34 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+def check_fit(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
+    """Compare weights with the network that they are for; only names and shapes are looked at.
+
+    Args:
+        network: of any device, ``meta`` included.
+        tensors: a state dict.
+        where: its file, for the message.
+
+    Returns:
+        Names of the network that the state dict does not have.
+
+    Raises:
+        UserError: the file has what the network has not, or in another shape.
+    """
+    own = network.state_dict()
+    faults = [
+        name if name not in own else f"{name} {tuple(tensor.shape)} instead of {tuple(own[name].shape)}"
+        for name, tensor in tensors.items()
+        if name not in own or own[name].shape != tensor.shape
+    ]
+    if faults:
+        raise UserError(
+            f"The weights in {where} do not fit the network that is to be trained ({_some(faults)}). "
+            "Choose the --preset that they were made with, or one with more modules on the same baseline."
+        )
+    return [name for name in own if name not in tensors]
+
+
 def start_from(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
     """Begin a training run with the weights of a network that may have fewer modules switched on.
 
@@ -117,25 +153,17 @@ def start_from(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -
     Raises:
         UserError: the file has what the network has not, or in another shape.
     """
-    own = network.state_dict()
-    faults = [
-        name if name not in own else f"{name} {tuple(tensor.shape)} instead of {tuple(own[name].shape)}"
-        for name, tensor in tensors.items()
-        if name not in own or own[name].shape != tensor.shape
-    ]
-    if faults:
-        raise UserError(
-            f"The weights in {where} do not fit the network that is to be trained ({len(faults)} tensors: "
-            f"{', '.join(faults[:_SHOWN_NAMES])}{' ...' if len(faults) > _SHOWN_NAMES else ''}). "
-            "Choose the --preset that they were made with, or one with more modules on the same baseline."
-        )
+    fresh = check_fit(network, tensors, where)
     network.load_state_dict(dict(tensors), strict=False)
-    return [name for name in own if name not in tensors]
+    return fresh
 
 
 def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
-    """Load a state dict; a mismatch (another preset or version) is the user's error."""
-    try:
-        network.load_state_dict(dict(tensors))
-    except RuntimeError as error:
-        raise UserError(f"The weights in {where} do not fit this network: {error}") from None
+    """Load a whole state dict; a mismatch (another preset or version) is the user's error."""
+    if absent := check_fit(network, tensors, where):
+        raise UserError(f"The weights in {where} lack some of this network ({_some(absent)}): choose their --preset.")
+    network.load_state_dict(dict(tensors))
+
+
+def _some(names: list[str]) -> str:
+    return f"{len(names)} tensors: {', '.join(names[:_SHOWN_NAMES])}{' ...' if len(names) > _SHOWN_NAMES else ''}"

@@ -109,9 +109,7 @@ class Trainer:
 
     def resume(self) -> None:
         """Continue from the newest checkpoint. Raises UserError if there is none."""
-        self._stored = checkpoint.latest(self._folder)
-        if self._stored is None:
-            raise UserError(f"There is no checkpoint in {self._folder} to resume from. Start without --resume.")
+        self._stored = checkpoint.to_resume(self._folder)
         stored = checkpoint.read_json(self._stored / "position.json")
         self.average.updates = stored.pop("average_updates")
         self.position = Position(**stored)

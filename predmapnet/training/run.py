@@ -79,6 +79,7 @@ def train(options: RunOptions, report: Report = print) -> Path | None:
     """
     _check_device(options)
     _check_folder(options)
+    _check_beginning(options)
     fill_demo_cache(_cache(options), _names(options, "train"), options.config, options.processes, report)
     fill_demo_cache(_cache(options), _names(options, "val"), options.config, options.processes, report)
     meeting_point = options.folder / f".meeting-{os.getpid()}"
@@ -197,6 +198,19 @@ def _check_folder(options: RunOptions) -> None:
         raise UserError(f"Stage {clips[0][0].name} needs a network that sees: give --resume or --init weights.")
     if options.settings.single is None and not (options.resume or options.initial):
         raise UserError("The temporal stage needs a network that sees: give --resume or --init weights.safetensors.")
+
+
+def _check_beginning(options: RunOptions) -> None:
+    """Refuse weights to begin with that are not there or do not fit, before anything is rendered."""
+    if not options.resume and options.initial is None:
+        return
+    with torch.device("meta"):
+        network = PredMapNet(options.config)
+    if options.resume:
+        newest = checkpoint.to_resume(options.folder)
+        checkpoint.check_fit(network, checkpoint.below_prefix("network", checkpoint.read(newest, "network")), newest)
+    elif options.initial is not None:
+        checkpoint.check_fit(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
 
 
 def _cache(options: RunOptions) -> Path:

@@ -11,6 +11,7 @@ import pytest
 import torch
 from painted_scenes import painted_scene, tiny_config
 
+from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import checkpoint
@@ -146,3 +147,21 @@ def test_a_gpu_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Pa
     with pytest.raises(UserError, match="no device cuda"):
         train(RunOptions(**common, **sizes, settings=SETTINGS, device="cuda"))
     assert not list(tmp_path.iterdir())
+
+
+def test_weights_that_do_not_fit_are_refused_before_anything_is_rendered(
+    tmp_path: Path, scenes: TrainingScenes
+) -> None:
+    run(tmp_path / "run", scenes)
+    wider = PredMapNetConfig.model_validate(tiny_config().model_dump() | {"decoder": {"width": 64}})
+    common = {"data": "demo", "cache": tmp_path / "cache", "settings": SETTINGS}
+    sizes = {"towns": 1, "validation_towns": 1, "processes": 1, "threads": 1}
+    for config, folder, start, says in (
+        (wider, "run", {"resume": True}, r"do not fit the network .*\(\d+ tensors: .* instead of"),
+        (tiny_config(), "empty", {"resume": True}, "no checkpoint"),
+        (tiny_config(), "new", {"initial": tmp_path / "absent.safetensors"}, "absent"),
+    ):
+        with pytest.raises(UserError, match=says) as caught:
+            train(RunOptions(**common, **sizes, config=config, folder=tmp_path / folder, **start))
+        assert "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
