@@ -56,6 +56,8 @@ class RegionOfInterest:
 class FrameMap:
     """What the mapper saw at one instant: polylines in the ego frame, as arrays of equal length.
 
+    Sequences become arrays and an integer of any type a plain one.
+
     Attributes:
         timestamp: integer nanoseconds.
         ego_to_global: ``(4, 4) float64``, maps ego coordinates to the data set's metric global frame.
@@ -88,6 +90,9 @@ class FrameMap:
     visible: tuple[Float, ...] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "timestamp", int(self.timestamp))
+        for name in ("ego_to_global", "kinds", "scores", "track_ids"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name)))
         lengths = {len(self.kinds), len(self.scores), len(self.track_ids), len(self.polylines)}
         if len(lengths) != 1:
             raise ValueError(f"kinds, scores, track_ids and polylines differ in length: {sorted(lengths)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from mapfusion.config import IntegratorConfig
 from mapfusion.curve import Curve
 from mapfusion.elements import ElementKind
+from mapfusion.export.geojson import write_whole
 from mapfusion.journal import LogBook
 from mapfusion.lines import Evidence, FusedLine
 from mapfusion.rings import FusedRing
@@ -81,14 +81,8 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
         "ring_seen_view": _flat(rings.values(), lambda ring: ring.seen_view.ravel(), np.float32),
         "views": _flat(tiles.values(), lambda tile: tile.ravel(), np.float32),
     }
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with write_whole(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_state(integrator: MapIntegrator, path: Path) -> None:

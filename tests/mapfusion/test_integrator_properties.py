@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator
+from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
 from mapfusion.geometry import transform_points
 from tests.mapfusion.map_quality import dense, nearest
 from tests.mapfusion.simulation import ROI, pose, town_drive
@@ -161,6 +161,18 @@ def test_broken_input_is_counted_and_changes_nothing(broken, reason):
     integrator.add(broken)
     assert integrator.rejections == {reason: 1}
     assert [e.points.tolist() for e in integrator.map()] == [e.points.tolist() for e in before]
+
+
+def test_frames_of_lists_and_numpy_integers_can_be_saved_and_resumed(tmp_path):
+    integrator = MapIntegrator()
+    for number in range(4):
+        line = np.array(LINE, dtype=np.float64)
+        region = RegionOfInterest()
+        integrator.add(FrameMap(np.int64(number * 10**8), np.eye(4).tolist(), region, [1], [0.9], [3], (line,)))
+    integrator.save(tmp_path / "state.npz")
+    resumed = MapIntegrator.load(tmp_path / "state.npz").map()
+    assert [e.points.tolist() for e in resumed] == [e.points.tolist() for e in integrator.map()]
+    assert len(resumed) == 1
 
 
 def straight_drive(count: int, start: float = 0.0) -> list[FrameMap]:
