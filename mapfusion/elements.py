@@ -41,10 +41,17 @@ class RegionOfInterest:
     Attributes:
         length: extent along x (forward), metres; x lies in ``[-length / 2, length / 2]``.
         width: extent along y (left), metres.
+
+    Raises:
+        ValueError: a side is not a positive number.
     """
 
     length: float = 60.0
     width: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.length < np.inf and 0.0 < self.width < np.inf):
+            raise ValueError(f"a region of interest has two positive sides, not {self.length} m and {self.width} m")
 
     @property
     def size(self) -> Float:

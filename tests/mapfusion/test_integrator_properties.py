@@ -175,6 +175,12 @@ def test_frames_of_lists_and_numpy_integers_can_be_saved_and_resumed(tmp_path):
     assert len(resumed) == 1
 
 
+@pytest.mark.parametrize("length", [0.0, -60.0, np.nan, np.inf])
+def test_a_region_without_area_is_refused(length):
+    with pytest.raises(ValueError, match="two positive sides"):
+        RegionOfInterest(length, 30.0)
+
+
 def straight_drive(count: int, start: float = 0.0) -> list[FrameMap]:
     """A car at 10 m/s past a line that lies 3 m to its left."""
     return [
