@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, PrecisionOption, Scheme, SplitScheme, Weights
+from cli.options import (
+    AllowMissingCameras,
+    Compile,
+    DataRoot,
+    Dataset,
+    Device,
+    PrecisionOption,
+    Scheme,
+    SplitScheme,
+    Weights,
+)
 from predmapnet.precision import Precision
 
 
@@ -26,6 +36,7 @@ def batch(
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
+    compiled: Compile = False,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
     """Map many scenes with several processes; run it again to resume where it stopped.
@@ -56,6 +67,7 @@ def batch(
         save_frames,
         threads=max(1, available_cores() // jobs),
         precision=precision,
+        compiled=compiled,
     )
     journal = BatchJournal(out)
     with progress_display() as display:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
+from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
 from predmapnet.precision import Precision
 
 
@@ -21,6 +21,7 @@ def infer(
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
+    compiled: Compile = False,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
@@ -34,7 +35,9 @@ def infer(
     use_threads(threads)
     from predmapnet.pipeline import MappingPipeline
 
-    pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras, precision)
+    pipeline = MappingPipeline.from_settings(
+        dataset, data_root, weights, device, allow_missing_cameras, precision, compiled
+    )
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)
     with progress_display() as display:

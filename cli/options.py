@@ -50,6 +50,14 @@ PrecisionOption = Annotated[
         "others float32 is faster. Everything else stays in float32.",
     ),
 ]
+Compile = Annotated[
+    bool,
+    typer.Option(
+        "--compile",
+        help="Compile the image backbone and the BEV encoder, for long runs on a GPU: the first frame waits for it, "
+        "up to some minutes.",
+    ),
+]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
 AllowMissingCameras = Annotated[
     bool, typer.Option("--allow-missing-cameras", help="Go on where a camera has no image, instead of stopping.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
+from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
 from predmapnet.precision import Precision
 
 
@@ -23,6 +23,7 @@ def view(
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
+    compiled: Compile = False,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
@@ -48,7 +49,9 @@ def view(
         use_threads(threads)
         from predmapnet.pipeline import MappingPipeline
 
-        pipeline = MappingPipeline.from_settings(dataset, data_root, weights, device, allow_missing_cameras, precision)
+        pipeline = MappingPipeline.from_settings(
+            dataset, data_root, weights, device, allow_missing_cameras, precision, compiled
+        )
         err.print(pipeline.sentence, markup=False)
         warn_of_weights(pipeline)
         with progress_display() as display:

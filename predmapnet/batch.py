@@ -42,7 +42,7 @@ class BatchSettings:
 
     Attributes:
         dataset, data_root: name and folder of the source that was opened.
-        weights, device, precision: as for a single scene.
+        weights, device, precision, compiled: as for a single scene.
         allow_missing_cameras: go on where a camera has no image.
         recordings, frames: write these files too.
         threads: CPU threads of each process.
@@ -57,6 +57,7 @@ class BatchSettings:
     frames: bool = False
     threads: int = 1
     precision: Precision = Precision.FLOAT32
+    compiled: bool = False
 
     def outputs(self, scene: str, folder: Path) -> Outputs:
         """Name the files of one scene."""
@@ -146,6 +147,7 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
         str(settings.data_root),
         settings.allow_missing_cameras,
         settings.precision,
+        settings.compiled,
     ]
     return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 
@@ -290,5 +292,6 @@ def _worker_pipeline(settings: BatchSettings) -> MappingPipeline:
             settings.device,
             settings.allow_missing_cameras,
             settings.precision,
+            settings.compiled,
         )
     return _pipeline

@@ -17,6 +17,7 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.source import Float, Frame, Image, Rig
 from predmapnet.errors import UserError
+from predmapnet.network.compilation import compile_features
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.inference import for_inference
 from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
@@ -62,6 +63,7 @@ class Mapper:
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
         facts: what the weights file tells of its training (:class:`predmapnet.weights.checkpoint.Checkpoint`).
         precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.low_precision`).
+        compiled: whether these two are compiled.
     """
 
     def __init__(
@@ -71,18 +73,26 @@ class Mapper:
         weights_sha256: str = "",
         facts: Mapping[str, Any] | None = None,
         precision: Precision = Precision.FLOAT32,
+        compiled: bool = False,
     ) -> None:
         self.network = in_precision(for_inference(network).to(device), precision)
         self.config: PredMapNetConfig = network.config
         self.weights_sha256 = weights_sha256
         self.facts: Mapping[str, Any] = dict(facts or {})
         self.precision = precision
+        self.compiled = compiled
+        if compiled:
+            compile_features(self.network)
         self._device = torch.device(device)
         self._lookups: list[tuple[Rig, RigGeometry]] = []
 
     @classmethod
     def from_checkpoint(
-        cls, path: Path | None = None, device: str = "auto", precision: Precision = Precision.FLOAT32
+        cls,
+        path: Path | None = None,
+        device: str = "auto",
+        precision: Precision = Precision.FLOAT32,
+        compiled: bool = False,
     ) -> Mapper:
         """Load a network.
 
@@ -90,12 +100,13 @@ class Mapper:
             path: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
             device: ``auto`` (a GPU if there is one), or as torch calls it.
             precision: of the image backbone and the BEV encoder.
+            compiled: whether these two are compiled, which the first frames wait for.
 
         Raises:
-            UserError: the weights or the device are not there.
+            UserError: the weights, the device or a compiler are not there.
         """
         checkpoint = load_checkpoint(path)
-        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts, precision)
+        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts, precision, compiled)
 
     @property
     def roi(self) -> RegionOfInterest:

@@ -123,6 +123,7 @@ class MappingPipeline:
         device: str = "auto",
         allow_missing_cameras: bool = False,
         precision: Precision = Precision.FLOAT32,
+        compiled: bool = False,
     ) -> MappingPipeline:
         """Choose the source and load the network, as the options of the commands say.
 
@@ -130,7 +131,9 @@ class MappingPipeline:
             UserError: what was asked for is missing or broken.
         """
         source, sentence = open_source(dataset, data_root)
-        return cls(source, Mapper.from_checkpoint(weights, device, precision), sentence, allow_missing_cameras)
+        return cls(
+            source, Mapper.from_checkpoint(weights, device, precision, compiled), sentence, allow_missing_cameras
+        )
 
     def run(
         self,
@@ -195,6 +198,7 @@ class MappingPipeline:
             "configuration": self.mapper.config.model_dump(mode="json"),
             "weights_sha256": self.mapper.weights_sha256,
             "precision": self.mapper.precision.value,
+            "compiled": self.mapper.compiled,
             "seed": SEED,
         }
         if self.note:

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 MANY_ROWS = 512
 """From here on a convolution's greater overhead pays."""
 
+ONEDNN = torch.backends.mkldnn.is_available()
+
 SMALLEST_BATCH = 16
 """From this batch on, torch gives 1x1 convolutions to oneDNN with any number of threads."""
 
@@ -30,7 +32,7 @@ def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor
     tokens = tokens.to(weight.dtype)
     rows = tokens.numel() // weight.shape[1]
     batch = _divisor(rows) if rows >= MANY_ROWS and tokens.device.type == "cpu" else None
-    if batch is None or not torch.backends.mkldnn.is_available():
+    if batch is None or not ONEDNN:
         return F.linear(tokens, weight, bias)
     pixels = tokens.reshape(batch, rows // batch, 1, -1).permute(0, 3, 1, 2)
     product = F.conv2d(pixels, weight[:, :, None, None], bias)
