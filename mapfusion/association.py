@@ -59,16 +59,17 @@ def gather(lines: Mapping[int, FusedLine], low: Float, high: Float) -> LocalStat
     sizes = np.array([len(curve) for curve in curves])
     ends = np.cumsum(sizes)
     points = np.concatenate(curves)
-    inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+    x, y = points[:, 0], points[:, 1]
+    (inside,) = ((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])).nonzero()
     if not len(inside):
         return None
-    owner = np.repeat(np.arange(len(curves)), sizes)[inside]
+    owner = np.repeat(np.arange(len(curves)), sizes).take(inside)
     return LocalStations(
         np.array(list(lines)),
         owner,
-        inside - (ends - sizes)[owner],
-        points[inside] - low,
-        tangents_of_all(points, ends)[inside],
+        inside - (ends - sizes).take(owner),
+        points.take(inside, axis=0) - low,
+        tangents_of_all(points, ends).take(inside, axis=0),
     )
 
 
@@ -93,7 +94,7 @@ def candidates(
     )
     if not len(match.station):
         return []
-    owner = local.owner[match.station]
+    owner = local.owner.take(match.station)
     count = np.bincount(owner)
     beside = np.flatnonzero(count).tolist()
     # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
@@ -115,8 +116,8 @@ def candidates(
             continue
         mismatch = squares[position] / overlap / config.match_distance**2
         benefit = overlap * max(1.0 - mismatch + TRACK_BONUS * frames / most, 0.01)
-        own = match if len(beside) == 1 else match.rows(np.flatnonzero(owner == position))
-        at_element = replace(own, station=local.row[own.station])
+        own = match if len(beside) == 1 else match.rows((owner == position).nonzero()[0])
+        at_element = replace(own, station=local.row.take(own.station))
         found.append(Candidate(element, at_element, float(overlap), distance, benefit))
     return found
 

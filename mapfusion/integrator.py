@@ -191,15 +191,15 @@ class MapIntegrator:
             match = beside(line.curve, curve, 1.5 * self.config.match_distance, self.config.match_angle)
             if not len(match.station):
                 return []
-        probes = np.flatnonzero((line.first + match.station) % PROBE_SPACING == 0)
+        (probes,) = ((line.first + match.station) % PROBE_SPACING == 0).nonzero()
         if len(probes):
-            station, vertex = match.station[probes], match.vertex[probes]
+            station, vertex = match.station.take(probes), match.vertex.take(probes)
             self.errors.note(
                 candidate.element,
                 line.first + station,
-                line.curve.points[station] + match.offset[probes],
-                observation.directions[vertex],
-                curve.information[vertex],
+                line.curve.points.take(station, axis=0) + match.offset.take(probes, axis=0),
+                observation.directions.take(vertex, axis=0),
+                curve.information.take(vertex),
                 (*instant.car, _number(observation.track)),
             )
         length, number = len(line.curve), line.first

@@ -116,14 +116,17 @@ def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
 def _average(base: Curve, new: Curve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
     """Move stations to the weighted mean, in place; returns the new curve's share in it, ``(n,)``."""
     station = match.station
-    added = new.sums[vertex]
-    known = base.sums[station, INFORMATION]
+    added = new.sums.take(vertex, axis=0)
+    known = base.sums[:, INFORMATION].take(station)
     gain = added[:, INFORMATION] / (known + added[:, INFORMATION])
     # scatter about the common mean of two groups (Chan, Golub and LeVeque, 1979)
     added[:, SCATTER] += gain * known * match.distance**2
-    base.points[station] += gain[:, None] * match.offset
-    base.sums[station] += added
-    base.marks[station] |= new.marks[vertex]
+    # most often stations without a gap: a slice is several times as fast as their numbers
+    first, last = int(station[0]), int(station[-1])
+    rows = slice(first, last + 1) if last - first == len(station) - 1 else station
+    base.points[rows] += gain[:, None] * match.offset
+    base.sums[rows] += added
+    base.marks[rows] |= new.marks.take(vertex, axis=0)
     return np.asarray(gain)
 
 

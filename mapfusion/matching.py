@@ -34,7 +34,11 @@ class Correspondence:
     def rows(self, rows: NDArray[np.intp]) -> Correspondence:
         """Return some of the stations."""
         return Correspondence(
-            self.station[rows], self.vertex[rows], self.offset[rows], self.distance[rows], self.same_way[rows]
+            self.station.take(rows),
+            self.vertex.take(rows),
+            self.offset.take(rows, axis=0),
+            self.distance.take(rows),
+            self.same_way.take(rows),
         )
 
 
@@ -94,16 +98,16 @@ def correspond(
     """
     (left, low), (right, high) = (curve.min(axis=0) - reach).tolist(), (curve.max(axis=0) + reach).tolist()
     x, y = stations[:, 0], stations[:, 1]
-    near = np.flatnonzero((x > left) & (x < right) & (y > low) & (y < high))
-    points = stations[near]
+    (near,) = ((x > left) & (x < right) & (y > low) & (y < high)).nonzero()
+    points = stations.take(near, axis=0)
     # |p - q|² without |p|², which does not change which q is nearest
     square = (curve[:, 0] ** 2 + curve[:, 1] ** 2) - 2.0 * (points @ curve.T)
-    cosine = directions[near] @ curve_tangents.T
+    cosine = directions.take(near, axis=0) @ curve_tangents.T
     one_way, any_way = cosine.min(axis=1) > 0.0, cosine.max(axis=1) > 0.0
-    lines = owner[near]
+    lines = owner.take(near)
     count = int(lines.max(initial=-1)) + 1
     feet = partial(_feet, points, cosine, curve, curve_tangents, reach, angle, end)
-    if np.array_equal(one_way, any_way):
+    if (one_way == any_way).all():
         # nothing folds back: each station has a nearest vertex of one way only
         vertex, offset, distance, keep = feet(square, one_way)
         weight = np.where(one_way, reach - distance, distance - reach)
@@ -121,8 +125,8 @@ def correspond(
         vertex, offset, distance, keep = (
             np.where(way if a.ndim == 1 else way[:, None], a, b) for a, b in zip(*found, strict=True)
         )
-    kept = np.flatnonzero(keep)
-    return Correspondence(near[kept], vertex[kept], offset[kept], distance[kept], way[kept])
+    (kept,) = keep.nonzero()
+    return Correspondence(near, vertex, offset, distance, way).rows(kept)
 
 
 def _feet(
@@ -146,12 +150,12 @@ def _feet(
         ahead: ``(n,)``, whether the station must run along the curve or against it.
     """
     vertex = square.argmin(axis=1)
-    tangent = curve_tangents[vertex]
-    gap = curve[vertex] - points
+    tangent = curve_tangents.take(vertex, axis=0)
+    gap = curve.take(vertex, axis=0) - points
     along = gap[:, 0] * tangent[:, 0] + gap[:, 1] * tangent[:, 1]
     offset = gap - along[:, None] * tangent
     distance = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    turn = cosine[np.arange(len(points)), vertex]
+    turn = cosine.take(np.arange(0, cosine.size, len(curve)) + vertex)
     aligned = np.where(ahead, turn, -turn) > math.cos(math.radians(angle))
     past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
     return vertex, offset, distance, (distance < reach) & aligned & ~past & (np.abs(along) < reach)

@@ -217,20 +217,23 @@ def _signed_distance(x: Float, y: Float, ring: Float, counts: NDArray[np.bool_])
     """
     origin = np.array([x[0], y[0]])
     start, stop = (ring[:-1] - origin).astype(np.float32), (ring[1:] - origin).astype(np.float32)
-    px = (x - origin[0]).astype(np.float32)[:, None, None]
-    py = (y - origin[1]).astype(np.float32)[None, :, None]
+    # edges come first, so that the innermost loops are long
+    px = (x - origin[0]).astype(np.float32)[:, None]
+    py = (y - origin[1]).astype(np.float32)
+    (x0, y0), (x1, y1) = start.T[:, :, None], stop.T[:, :, None]
     # even-odd rule along rows; the abscissa of an edge at height y depends on y alone
-    rise = np.where(stop[:, 1] == start[:, 1], np.float32(1e-6), stop[:, 1] - start[:, 1])
-    crossed = (start[:, 1] > py[0]) != (stop[:, 1] > py[0])
-    abscissa = start[:, 0] + (py[0] - start[:, 1]) / rise * (stop[:, 0] - start[:, 0])
-    inside = np.count_nonzero(crossed & (px < abscissa), axis=2) % 2 == 1
+    rise = np.where(y1 == y0, np.float32(1e-6), y1 - y0)
+    crossed = (y0 > py) != (y1 > py)
+    abscissa = x0 + (py - y0) / rise * (x1 - x0)
+    inside = np.logical_xor.reduce(crossed[:, None] & (px < abscissa[:, None]))
     if not counts.any():
         return np.where(inside, np.float32(TRUNCATION), np.float32(-TRUNCATION))
     first, edge = start[counts], (stop - start)[counts]
-    square = np.maximum((edge**2).sum(axis=1), np.float32(1e-9))
-    dx, dy = px - first[:, 0], py - first[:, 1]
-    along = np.clip((dx * edge[:, 0] + dy * edge[:, 1]) / square, 0, 1)
-    nearest = np.sqrt(((dx - along * edge[:, 0]) ** 2 + (dy - along * edge[:, 1]) ** 2).min(axis=2))
+    square = np.maximum((edge**2).sum(axis=1), np.float32(1e-9))[:, None, None]
+    ex, ey = edge.T[:, :, None, None]
+    dx, dy = px - first[:, 0, None, None], py - first[:, 1, None, None]
+    along = ((dx * ex + dy * ey) / square).clip(0, 1)
+    nearest = np.sqrt(((dx - along * ex) ** 2 + (dy - along * ey) ** 2).min(axis=0))
     nearest = np.minimum(nearest, np.float32(TRUNCATION))
     return np.asarray(np.where(inside, nearest, -nearest), dtype=np.float32)
 
