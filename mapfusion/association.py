@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +96,7 @@ def candidates(
         return []
     owner = local.owner.take(match.station)
     count = np.bincount(owner)
-    beside = np.flatnonzero(count).tolist()
+    beside = count.nonzero()[0].tolist()
     # squares, because only they prefer to keep two parallel lines in order when both observations lie to one side
     counts, totals, squares = (
         values.tolist()
@@ -117,7 +117,7 @@ def candidates(
         mismatch = squares[position] / overlap / config.match_distance**2
         benefit = overlap * max(1.0 - mismatch + TRACK_BONUS * frames / most, 0.01)
         own = match if len(beside) == 1 else match.rows((owner == position).nonzero()[0])
-        at_element = replace(own, station=local.row.take(own.station))
+        at_element = own.renumbered(local.row.take(own.station))
         found.append(Candidate(element, at_element, float(overlap), distance, benefit))
     return found
 

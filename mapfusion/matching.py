@@ -41,6 +41,10 @@ class Correspondence:
             self.same_way.take(rows),
         )
 
+    def renumbered(self, station: Integer) -> Correspondence:
+        """Return it with other numbers of the same stations."""
+        return Correspondence(station, self.vertex, self.offset, self.distance, self.same_way)
+
 
 def tangents(points: Float) -> Float:
     """Return unit directions ``(n, 2)`` at the vertices of a line ``(n, 2)``, from its neighbours."""

@@ -206,9 +206,10 @@ def _element_problem(
         if points.ndim != 2 or points.shape[1] != 2:
             return "points are not (n, 2)"
         return "fewer than two points" if len(points) < 2 else "too many points"
-    if not all(math.isfinite(value) for corner in extent for value in corner):
+    low, high = extent
+    if not (math.isfinite(low[0]) and math.isfinite(low[1]) and math.isfinite(high[0]) and math.isfinite(high[1])):
         return "points not finite"
-    if extent[0] == extent[1]:
+    if low == high:
         return "line without length"
     return None
 
