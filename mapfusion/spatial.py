@@ -55,7 +55,7 @@ class TileIndex:
         return sorted(found)
 
     def around(self, points: Float, reach: float) -> set[int]:
-        """Return the ids with a point in a tile that touches the square of ``reach`` around one of ``(n, 2)`` points."""
+        """Return ids with a point in a tile that touches the square of ``reach`` around one of ``(n, 2)`` points."""
         steps = np.linspace(-reach, reach, int(2 * reach // TILE_SIZE) + 2)
         corners = [points + np.array([x, y]) for x in steps for y in steps]
         tiles = set(_key(np.floor(np.concatenate(corners) / TILE_SIZE).astype(np.int64)).tolist())
