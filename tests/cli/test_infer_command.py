@@ -218,13 +218,20 @@ def test_a_folder_that_cannot_be_written_to_is_told_first(infer):
     assert "no-such-scene" not in result.err
 
 
+def heed_interrupts():
+    """Undo what a shell does to commands in the background: they would not hear Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_ctrl_c_says_one_line_and_leaves_nothing(random_weights, tmp_path):
     root = write_tiny_nuscenes(tmp_path / "long", frames=60)
     folder = tmp_path / "out"
     folder.mkdir()
     command = [sys.executable, "-m", "cli.main", "infer", "scene-0001", "--out", folder / "map.geojson"]
     settings = ["--recording", folder / "r.rrd", "--data-root", root, "--weights", random_weights, "--threads", "1"]
-    with subprocess.Popen([*command, *settings], stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [*command, *settings], stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    ) as process:
         deadline = time.monotonic() + 300
         while not mapping_began(folder) and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.05)
