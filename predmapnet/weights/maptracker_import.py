@@ -139,8 +139,8 @@ def _configuration(
             f"({', '.join(config.bev.cameras)})."
         )
     size = official.get("head.roi_size")
-    if size is None or size.shape != (2,):
-        return config
+    if size is None or size.shape != (2,) or not bool(((size > 0) & size.isfinite()).all()):
+        return config  # What is wrong with a region that is there is told where constants are compared.
     return config.model_copy(update={"roi_length": float(size[0]), "roi_width": float(size[1])})
 
 
