@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from mapfusion.export.geojson import (
     InvertibleGeoreference,
     elements_of,
     feature_of,
+    origin_of,
     write_whole,
 )
 
@@ -43,12 +43,7 @@ def write_geodatabase(
     import pyogrio.errors
 
     features = [feature_of(element, georeference) for element in global_map]
-    origin = {
-        **global_map.provenance,
-        **(provenance or {}),
-        "georeference": georeference.name,
-        "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-    }
+    origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     rows = list(enumerate(features))
     with write_whole(path) as temporary:
         try:

@@ -119,17 +119,19 @@ class GeoJsonWriter:
         document: dict[str, Any] = {"type": "FeatureCollection"}
         if self._count:
             document["bbox"] = [*self._low.tolist(), *self._high.tolist()]
-        document["predmapnet"] = {
-            **self._provenance,
-            "georeference": self._georeference.name,
-            "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-        }
+        document["predmapnet"] = origin_of(self._provenance, self._georeference)
         head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
         self._body.seek(0)
         with write_whole(self._path) as temporary, temporary.open("w", encoding="utf-8") as file:
             file.write(f'{head},"features":[')
             shutil.copyfileobj(self._body, file)
             file.write("\n]}\n" if self._count else "]}\n")
+
+
+def origin_of(provenance: Mapping[str, Any], georeference: Georeference) -> dict[str, Any]:
+    """Return what a file says of itself in every format: the provenance, where its coordinates come from, and when."""
+    created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+    return {**provenance, "georeference": georeference.name, "created": created}
 
 
 def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:

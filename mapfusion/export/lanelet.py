@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -25,6 +24,7 @@ from mapfusion.export.geojson import (
     InvertibleGeoreference,
     elements_of,
     feature_of,
+    origin_of,
     write_whole,
 )
 
@@ -45,12 +45,7 @@ def write_lanelet(
         ValueError: coordinates that are not on the globe.
         OSError: the file cannot be written.
     """
-    origin = {
-        **global_map.provenance,
-        **(provenance or {}),
-        "georeference": georeference.name,
-        "created": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-    }
+    origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     with write_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(
             '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" upload="false" generator="predmapnet">\n'
