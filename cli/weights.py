@@ -37,9 +37,9 @@ def import_weights(
 
     Nothing in the checkpoint is executed; entries that do not fit are an error.
     """
-    from predmapnet.config import load_config
     from predmapnet.errors import UserError
     from predmapnet.files import check_output
+    from predmapnet.presets import load_config
 
     if out.suffix != ".safetensors":
         raise UserError(f"Weights are written as safetensors: name a file that ends so, not {out.name}.")

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import torch
 
-from predmapnet.config import PredMapNetConfig, load_config
+from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import load_config
 from predmapnet.threads import end_with_parent
 from predmapnet.training import checkpoint
 from predmapnet.training.batches import TrainingScenes

@@ -17,10 +17,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from predmapnet import __version__
-from predmapnet.config import parse_config
 from predmapnet.errors import UserError
 from predmapnet.files import write_whole
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import parse_config
 from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
 
 FORMAT = 1

@@ -11,8 +11,8 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from predmapnet.config import parse_config
 from predmapnet.errors import UserError
+from predmapnet.presets import parse_config
 from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
 
 

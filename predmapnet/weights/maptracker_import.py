@@ -11,10 +11,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from predmapnet.config import PRESETS, BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig, preset
+from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import PRESETS, preset
 from predmapnet.weights.maptracker_names import name_here, original_of_alias
 
 BEGINNINGS = (b"PK", b"\x80\x02", b"\x80\x04", b"\x80\x05")

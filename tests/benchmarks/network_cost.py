@@ -29,7 +29,7 @@ if __name__ == "__main__":  # Before torch is imported.
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from predmapnet.config import PredMapNetConfig, preset
+from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import input_size
 from predmapnet.network.inference import for_inference
@@ -37,6 +37,7 @@ from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, S
 from predmapnet.network.matrix_product import linear
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import instances_from_rows, select
+from predmapnet.presets import preset
 from tests.benchmarks.part_costs import OF_THE_PAPER, PARTS, THE_REST, Ledger, parameters_of_parts
 
 TRACKS = 30

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from predmapnet.config import preset
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import save_checkpoint
 from tests.cli.tiny_nuscenes import write_tiny_nuscenes
 

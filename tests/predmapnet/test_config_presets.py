@@ -5,8 +5,9 @@ import json
 import pytest
 from pydantic import ValidationError
 
-from predmapnet.config import PredMapNetConfig, load_config, parse_config, preset
+from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
+from predmapnet.presets import load_config, parse_config, preset
 
 
 def test_json_brings_a_configuration_back():

@@ -4,11 +4,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from predmapnet.config import PredMapNetConfig, preset
+from predmapnet.config import PredMapNetConfig
 from predmapnet.network.camera_pillars import CameraPillars, make_camera_pillars
 from predmapnet.network.interface import FrameInputs
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.tracking import select
+from predmapnet.presets import preset
 
 SIZE = (64, 96)
 SECTIONS = {

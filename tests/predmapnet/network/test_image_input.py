@@ -14,7 +14,7 @@ from pyarrow import feather
 from pydantic import ValidationError
 
 from mapfusion.geometry import inverse_pose
-from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageConfig, preset
+from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageConfig
 from predmapnet.datasets.argoverse2 import GROUND_HEIGHT, Argoverse2Source
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes import NuScenesSource
@@ -30,6 +30,7 @@ from predmapnet.network.image_input import (
     stack_windows,
 )
 from predmapnet.network.view_transform import make_rig_lookup
+from predmapnet.presets import preset
 from tests.predmapnet.network.maptracker_reference import FOLDER
 
 WHOLE = WholeImageConfig()

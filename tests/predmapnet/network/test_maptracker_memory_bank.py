@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import preset
 from predmapnet.network.motion_mlp import MotionMlp
 from predmapnet.network.vector_memory import empty_vector_memory, recall, remember
+from predmapnet.presets import preset
 from tests.predmapnet.network.maptracker_reference import FOLDER, difference, load_reference, pose
 
 BANK = FOLDER / "vector_memory_unit.npz"

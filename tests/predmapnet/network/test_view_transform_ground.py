@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import preset
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_backbone import STRIDE
 from predmapnet.network.image_input import crop_image, image_window, mirror_order, mirror_rig
 from predmapnet.network.layers import cell_centres
 from predmapnet.network.view_transform import make_rig_lookup, to_ground
+from predmapnet.presets import preset
 
 CONFIG = preset("lite")
 LOOKUP = make_rig_lookup(DEMO_RIG, CONFIG)

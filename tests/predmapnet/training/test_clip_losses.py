@@ -6,9 +6,9 @@ import pytest
 import torch
 from tiny_clips import painted_clip, tiny_network, tiny_paper_config
 
-from predmapnet.config import preset
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.training.clip_losses import clip_losses
 from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
 

@@ -9,9 +9,9 @@ import torch
 from painted_scenes import painted_scene
 from tiny_clips import tiny_paper_config
 
-from predmapnet.config import preset
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.clip_settings import BEV_PARTS, CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import ClipTraining, ImageClips

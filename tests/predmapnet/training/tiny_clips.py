@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from painted_scenes import painted_scene
 
-from predmapnet.config import PredMapNetConfig, preset
+from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.interface import FrameInputs
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.training.clip_losses import ClipFrame
 from predmapnet.training.targets import truth_targets
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from predmapnet.config import preset
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 from predmapnet.weights.files import weights_hash
 

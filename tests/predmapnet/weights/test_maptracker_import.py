@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.config import preset
 from predmapnet.errors import UserError
+from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 from predmapnet.weights.inspection import inspect_file, parts_of
 from predmapnet.weights.maptracker_import import (
