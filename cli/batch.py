@@ -45,9 +45,9 @@ def batch(
     scene failed.
     """
     from cli.console import err, progress_display, say_outcomes
-    from predmapnet.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
-    from predmapnet.datasets.selection import open_source
-    from predmapnet.threads import available_cores
+    from predmapnet.machine import available_cores
+    from predmapnet.runs.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
+    from predmapnet.sources import open_source
     from predmapnet.weights.files import weights_hash
 
     names = list(scenes or [])

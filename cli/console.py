@@ -15,8 +15,8 @@ from rich.table import Table
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from predmapnet.batch import Outcome
-    from predmapnet.pipeline import MappingPipeline, SceneReport
+    from predmapnet.runs.batch import Outcome
+    from predmapnet.runs.infer import MappingPipeline, SceneReport
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)

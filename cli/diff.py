@@ -27,7 +27,7 @@ def diff(
     from cli.console import err
     from cli.console import out as screen
     from mapfusion.diff import DiffConfig, diff_maps, write_diff
-    from mapfusion.io import read_maps
+    from mapfusion.formats.by_suffix import read_maps
     from predmapnet.errors import UserError
     from predmapnet.files import check_output
 

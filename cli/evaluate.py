@@ -56,7 +56,7 @@ def evaluate(
     """Measure maps of frames and of whole drives with the metrics of the field."""
     from cli.console import err, out, progress_display
     from predmapnet.files import check_output
-    from predmapnet.threads import available_cores, use_threads
+    from predmapnet.machine import available_cores, use_threads
 
     for path in (json_file, report):
         if path is not None:
@@ -68,7 +68,7 @@ def evaluate(
     from predmapnet.errors import UserError
     from predmapnet.evaluation.measurement import pool_scenes
     from predmapnet.evaluation.report import write_figures, write_report
-    from predmapnet.evaluation.runs import EvaluationSettings, measure_scenes, scenes_to_measure
+    from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, scenes_to_measure
 
     if results is not None and not results.exists():
         raise UserError(f"There is no file or folder {results}.")

@@ -27,13 +27,13 @@ def infer(
 ) -> None:
     """Turn one driving scene into a global vector map."""
     from cli.console import err, progress_display, say_report, warn_of_weights
-    from predmapnet.outputs import Outputs
-    from predmapnet.threads import use_threads
+    from predmapnet.machine import use_threads
+    from predmapnet.runs.outputs import Outputs
 
     outputs = Outputs(out, recording, save_frames)
     outputs.check()
     use_threads(threads)
-    from predmapnet.pipeline import MappingPipeline
+    from predmapnet.runs.infer import MappingPipeline
 
     pipeline = MappingPipeline.from_settings(
         dataset, data_root, weights, device, allow_missing_cameras, precision, compiled

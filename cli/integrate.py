@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from mapfusion.elements import RegionOfInterest
-    from mapfusion.export.geojson import Georeference
+    from mapfusion.formats.geojson import Georeference
 
 
 def integrate(
@@ -41,13 +41,13 @@ def integrate(
     """Fuse what any detector saw, frame by frame, into one map."""
     from cli.console import out as screen
     from cli.console import say_warning
-    from mapfusion.coverage import observed_rings
     from mapfusion.elements import ElementKind
-    from mapfusion.io import write_map
+    from mapfusion.formats.by_suffix import write_map
+    from mapfusion.ground import observed_rings
     from predmapnet import __version__
     from predmapnet.errors import UserError
-    from predmapnet.integration import integrate_file
-    from predmapnet.outputs import Outputs
+    from predmapnet.runs.integrate import integrate_file
+    from predmapnet.runs.outputs import Outputs
 
     Outputs(map=out).check()
     region = _region(roi)
@@ -92,7 +92,7 @@ def _region(text: str) -> RegionOfInterest:
 
 
 def _georeference(location: str | None, origin: str | None, synthetic: bool = False) -> Georeference:
-    from mapfusion.export.plane import LocalPlane
+    from mapfusion.formats.local_plane import LocalPlane
     from predmapnet.datasets.georeference import ARGOVERSE2_CITIES, NUSCENES_ORIGINS, georeference_of
     from predmapnet.errors import UserError
 

@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from mapfusion.merge_report import MergeReport
+    from mapfusion.merge.report import MergeReport
 
 
 def merge(
@@ -23,10 +23,10 @@ def merge(
     """Merge the maps of many drives: offsets between drives taken out, evidence added up."""
     from cli.console import out as screen
     from cli.console import progress_display, say_warning
-    from mapfusion.export.qgis_style import write_styles
-    from mapfusion.io import check_suffix
-    from mapfusion.merge import merge_files
-    from mapfusion.merge_lines import MergeConfig
+    from mapfusion.formats.by_suffix import check_suffix
+    from mapfusion.formats.qgis_style import write_styles
+    from mapfusion.merge.lines import MergeConfig
+    from mapfusion.merge.merge import merge_files
     from predmapnet import __version__
     from predmapnet.errors import UserError
     from predmapnet.files import check_output
@@ -53,7 +53,7 @@ def merge(
 
 
 def _files(maps: list[Path], out: Path) -> list[Path]:
-    from mapfusion.io import SUFFIXES
+    from mapfusion.formats.by_suffix import SUFFIXES
     from predmapnet.errors import UserError
 
     paths: list[Path] = []

@@ -19,7 +19,7 @@ def scenes(
     official_frames: OfficialFrames = False,
 ) -> None:
     """List the scenes of a data set."""
-    from predmapnet.datasets.selection import open_source
+    from predmapnet.sources import open_source
 
     source, sentence = open_source(dataset, data_root, split_scheme.value, official_frames)
     found = source.scenes(split)

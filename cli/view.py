@@ -33,8 +33,8 @@ def view(
     """
     from cli.console import err, progress_display, say_report, warn_of_weights
     from cli.viewer import Viewer
-    from predmapnet.outputs import Outputs
-    from predmapnet.threads import use_threads
+    from predmapnet.machine import use_threads
+    from predmapnet.runs.outputs import Outputs
 
     if what.endswith(".rrd"):
         Viewer.show_file(Path(what), web, port)
@@ -47,7 +47,7 @@ def view(
             log_map_file(viewer.recording, Path(what))
             return
         use_threads(threads)
-        from predmapnet.pipeline import MappingPipeline
+        from predmapnet.runs.infer import MappingPipeline
 
         pipeline = MappingPipeline.from_settings(
             dataset, data_root, weights, device, allow_missing_cameras, precision, compiled

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion import ElementKind, GlobalMap
-from mapfusion.export.geojson import read_geojson
+from mapfusion.formats.geojson import read_geojson
 
 COLOURS = {ElementKind.PED_CROSSING: "#56b4e9", ElementKind.DIVIDER: "#ffb000", ElementKind.BOUNDARY: "#40d689"}
 PIXELS_PER_METRE = 4.0

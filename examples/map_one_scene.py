@@ -9,10 +9,10 @@ import sys
 from pathlib import Path
 
 from mapfusion import ElementKind, MapIntegrator
-from mapfusion.export.geojson import write_geojson
-from predmapnet.datasets.selection import open_source
+from mapfusion.formats.geojson import write_geojson
 from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.mapper import Mapper
+from predmapnet.sources import open_source
 
 
 def main(scene_name: str, path: Path, weights: Path | None = None) -> None:

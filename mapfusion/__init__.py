@@ -1,8 +1,8 @@
 """Vector maps and their integration: tracked polylines and poses in, one global map out. No torch."""
 
-from mapfusion.config import IntegratorConfig
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
-from mapfusion.integrator import MapIntegrator
+from mapfusion.integrate.config import IntegratorConfig
+from mapfusion.integrate.integrator import MapIntegrator
 from mapfusion.visibility import CameraSector, visible_ground
 
 __all__ = [

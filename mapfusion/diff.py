@@ -14,10 +14,10 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.alignment import Alignment, align, landmarks
-from mapfusion.coverage import coverage, inside
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.export.geojson import DECIMALS, Georeference, InvertibleGeoreference, write_whole
+from mapfusion.formats.geojson import DECIMALS, Georeference, InvertibleGeoreference, write_whole
 from mapfusion.geometry import arc_length
+from mapfusion.ground import coverage, inside
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
 
 Float = NDArray[np.float64]
@@ -130,7 +130,7 @@ def diff_maps(
     old one only, so that a double line that became a single one shows. What lies farther off than
     :attr:`DiffConfig.tolerance` has moved, unless that is within what the maps state of their own uncertainty. What
     the old map has and the new one lacks is removed where the new map's drive has looked
-    (:func:`mapfusion.coverage.coverage`), else unobserved.
+    (:func:`mapfusion.ground.coverage`), else unobserved.
 
     Args:
         old, new: the maps, metres.

@@ -140,7 +140,7 @@ class MapElement:
             chance, ``source_track_ids`` tells them apart.
         deviation: ``(n,) float64``, metres, standard deviation of each vertex across the line, if known: 95 % of the
             true curve lies within 1.96 deviations of this one, measured across it. What of the detector's error does
-            not average out is in it (:mod:`mapfusion.uncertainty`); an offset of the poses as a whole is not.
+            not average out is in it (:mod:`mapfusion.integrate.uncertainty`); an offset of the poses as a whole is not.
         sources: names of the drives, or of the maps if those do not name any, that it comes from, ascending.
         source_track_ids: ids of the tracks in each of the sources, in their order.
     """

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mapfusion.geometry import arc_length
-from mapfusion.matching import tangents
+from mapfusion.integrate.matching import tangents
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]

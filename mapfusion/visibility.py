@@ -15,9 +15,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from mapfusion.coverage import ground_within, rings_around
 from mapfusion.elements import FrameMap, RegionOfInterest
 from mapfusion.geometry import transform_points
+from mapfusion.ground import ground_within, rings_around
 
 Float = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from mapfusion.coverage import ground_within, rings_around
 from mapfusion.elements import RegionOfInterest
+from mapfusion.ground import ground_within, rings_around
 from mapfusion.visibility import CameraSector, region, visible_ground
-from predmapnet.datasets.source import Camera, Frame
+from predmapnet.scenes import Camera, Frame
 
 Float = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mapfusion.config import IntegratorConfig
+from mapfusion.integrate.config import IntegratorConfig
 
 NETWORK_ERRORS = IntegratorConfig(common_deviation=0.2)
 """A network with a memory repeats its error from frame to frame, so that its detections agree better with each other

@@ -15,17 +15,17 @@ from torch import Tensor
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
-from predmapnet.datasets.source import Float, Frame, Image, Rig
 from predmapnet.errors import UserError
-from predmapnet.network.compilation import compile_features
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
-from predmapnet.network.inference import for_inference
-from predmapnet.network.interface import FrameInputs, Instances, RigGeometry, Selection, StreamState
-from predmapnet.network.low_precision import in_precision
+from predmapnet.network.kernels.compilation import compile_features
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.rig_geometry import arranged_rig
-from predmapnet.network.tracking import select
+from predmapnet.network.state import FrameInputs, Instances, RigGeometry, Selection, StreamState
+from predmapnet.network.track_selection import select
 from predmapnet.precision import Precision
+from predmapnet.scenes import Float, Frame, Image, Rig
 from predmapnet.weights.checkpoint import load_checkpoint
 
 RIG_TOLERANCE = 1e-4
@@ -62,7 +62,7 @@ class Mapper:
         config: of the network.
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
         facts: what the weights file tells of its training (:class:`predmapnet.weights.checkpoint.Checkpoint`).
-        precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.low_precision`).
+        precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.kernels.low_precision`).
         compiled: whether these two are compiled.
     """
 
@@ -250,7 +250,7 @@ def to_frame_map(
     """Everything that is reported of one frame of one stream: tracks first, then detections without a track.
 
     Args:
-        selection: what :func:`predmapnet.network.tracking.select` chose.
+        selection: what :func:`predmapnet.network.track_selection.select` chose.
         state: after the frame.
         segmentation: ``(1, 3, H_s, W_s)`` logits.
         config: of the network.

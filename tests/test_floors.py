@@ -26,5 +26,5 @@ def test_no_room_imports_from_above(room, forbidden):
 
 
 def test_mapfusion_comes_without_torch():
-    code = "import sys, mapfusion, mapfusion.integrator; sys.exit('torch' in sys.modules)"
+    code = "import sys, mapfusion, mapfusion.integrate.integrator; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -34,9 +34,9 @@ from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_argoverse2_sweep
 from predmapnet.datasets.poses import pose_matrix
-from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
+from predmapnet.scenes import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]

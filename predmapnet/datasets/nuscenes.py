@@ -22,9 +22,9 @@ from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_nuscenes_sweep
 from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
 from predmapnet.datasets.poses import combined, pose_matrix
-from predmapnet.datasets.source import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
+from predmapnet.scenes import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
 
 Float = NDArray[np.float64]
 

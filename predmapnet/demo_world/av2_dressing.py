@@ -13,9 +13,9 @@ from shapely import Polygon
 
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.ground_truth.map_file import read_map
-from predmapnet.datasets.source import Rig
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
+from predmapnet.scenes import Rig
 
 Float = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from predmapnet.datasets.source import Progress, SceneInfo
-from predmapnet.demo_world.routes import KEY_FRAMES, drive
-from predmapnet.demo_world.town import Town, build_town
+from predmapnet.demo_world.town.routes import KEY_FRAMES, drive
+from predmapnet.demo_world.town.town import Town, build_town
 from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
+from predmapnet.scenes import Progress, SceneInfo
 
 WORLD_VERSION = 1
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
@@ -104,7 +104,7 @@ def trajectory(name: str) -> Trajectory:
 
 def build_world(name: str) -> World:
     """Everything the renderer needs to draw a scene."""
-    from predmapnet.demo_world.dressing import dress
+    from predmapnet.demo_world.street.dressing import dress
 
     return dress(vector_map(name), trajectory(name), look_of(name), scene_number(name), name)
 
@@ -141,7 +141,7 @@ def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Pa
     folder = scene_folder(name, cache)
     scene_number(name)
     if not folder.exists():
-        from predmapnet.demo_world.nuscenes_writer import write_scene
+        from predmapnet.demo_world.nuscenes.writer import write_scene
 
         write_scene(build_world(name), folder, WORLD_VERSION, progress=progress)
     return folder

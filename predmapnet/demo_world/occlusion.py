@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import inverse_pose
-from predmapnet.datasets.source import Rig
-from predmapnet.demo_world.renderer import Renderer
+from predmapnet.demo_world.render.renderer import Renderer
+from predmapnet.scenes import Rig
 
 Float = NDArray[np.float64]
 

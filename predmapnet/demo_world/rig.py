@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from predmapnet.datasets.source import Camera, Rig
+from predmapnet.scenes import Camera, Rig
 
 Float = NDArray[np.float64]
 

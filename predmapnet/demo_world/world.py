@@ -1,7 +1,7 @@
 """The nouns of the demo world: what is true about the road, what stands on it, and how it looks.
 
 A :class:`VectorMap` and a :class:`Trajectory` come from a town generator or from a real data set;
-:func:`predmapnet.demo_world.dressing.dress` turns them into a :class:`World`, which the renderer draws.
+:func:`predmapnet.demo_world.street.dressing.dress` turns them into a :class:`World`, which the renderer draws.
 Coordinates are metres in the global frame; the road surface is the plane z = 0.
 """
 

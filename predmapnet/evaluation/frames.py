@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap
 from predmapnet.datasets.ground_truth.vectors import SIMPLIFICATION
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
+from predmapnet.scenes import FrameTruth
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]

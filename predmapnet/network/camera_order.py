@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from predmapnet.datasets.source import Rig
 from predmapnet.errors import UserError
+from predmapnet.scenes import Rig
 
 
 def in_learned_order(rig: Rig, cameras: Sequence[str], name: str) -> Rig:

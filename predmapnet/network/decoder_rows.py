@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.network.vector_memory import Recalled
+from predmapnet.network.maptracker.vector_memory import Recalled
 
 
 @dataclass

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.network.normalised_convolution import NormalisedConvolution
+from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 
 
 class FeaturePyramid(nn.Module):

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.network.matrix_product import Linear
+from predmapnet.network.kernels.matrix_product import Linear
 
 
 class Attention(nn.Module):

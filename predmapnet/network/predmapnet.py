@@ -13,20 +13,28 @@ from predmapnet.config import (
     ResidualBevMemoryConfig,
     ResNet50Config,
 )
-from predmapnet.datasets.source import Rig
-from predmapnet.network.bev_encoder import BevEncoder
-from predmapnet.network.bev_history import keep_map
 from predmapnet.network.bev_pyramid import BevPyramid
-from predmapnet.network.bevformer import BevFormer
 from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
 from predmapnet.network.history_guidance import HistoryMapGuidance
 from predmapnet.network.history_memory import HistoryRasterMapMemory
-from predmapnet.network.image_backbone import ImageBackbone
 from predmapnet.network.instance_masks import MaskHead
-from predmapnet.network.interface import (
+from predmapnet.network.maptracker.bev_memory import keep_map
+from predmapnet.network.maptracker.bevformer import BevFormer
+from predmapnet.network.maptracker.decoder import MapTrackerDecoder
+from predmapnet.network.maptracker.resnet import ResNet50Pyramid
+from predmapnet.network.maptracker.vector_memory import empty_vector_memory, remember
+from predmapnet.network.revival import recall, still_lost
+from predmapnet.network.rig_geometry import make_rig_geometry
+from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
+from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
+from predmapnet.network.small.backbone import ImageBackbone
+from predmapnet.network.small.bev_encoder import BevEncoder
+from predmapnet.network.small.bev_memory import TemporalBevFusion, empty_memory, remember_bev
+from predmapnet.network.small.decoder import MapDecoder
+from predmapnet.network.state import (
     BevFeatures,
     FrameInputs,
     FrameOutputs,
@@ -38,17 +46,9 @@ from predmapnet.network.interface import (
     StreamState,
     VectorMemory,
 )
-from predmapnet.network.map_decoder import MapDecoder
-from predmapnet.network.maptracker_decoder import MapTrackerDecoder
-from predmapnet.network.resnet import ResNet50Pyramid
-from predmapnet.network.revival import recall, still_lost
-from predmapnet.network.rig_geometry import make_rig_geometry
-from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
-from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
-from predmapnet.network.temporal_bev import TemporalBevFusion, empty_memory, remember_bev
 from predmapnet.network.track_memory import match_tracks, memory_of_tracks
 from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
-from predmapnet.network.vector_memory import empty_vector_memory, remember
+from predmapnet.scenes import Rig
 
 
 class PredMapNet(nn.Module):
@@ -276,7 +276,7 @@ class PredMapNet(nn.Module):
         Args:
             state: that went into :meth:`forward`.
             outputs: that came out.
-            instances: chosen by :func:`predmapnet.network.tracking.select` or by the training.
+            instances: chosen by :func:`predmapnet.network.track_selection.select` or by the training.
             inputs: of the same frame; only the poses are used.
             lost: what the selection says of lost tracks; without it, a track that ended is forgotten.
         """

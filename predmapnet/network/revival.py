@@ -17,7 +17,7 @@ from torch import Tensor
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PredMapNetConfig, RevivalConfig
 from predmapnet.network.ego_motion import move_points, relative_motion, warp_bev
-from predmapnet.network.interface import Instances, LostTracks, StreamState
+from predmapnet.network.state import Instances, LostTracks, StreamState
 from predmapnet.network.track_memory import TrackMemory, match_tracks
 
 ROUNDS = 3

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 
 from predmapnet.config import BevFormerConfig, PredMapNetConfig
-from predmapnet.datasets.source import Rig
 from predmapnet.errors import UserError
 from predmapnet.network.camera_order import in_learned_order
-from predmapnet.network.camera_pillars import make_camera_pillars
 from predmapnet.network.image_input import ego_to_image, input_size
-from predmapnet.network.interface import RigGeometry
-from predmapnet.network.view_transform import make_rig_lookup
+from predmapnet.network.maptracker.camera_pillars import make_camera_pillars
+from predmapnet.network.small.ground_lookup import make_rig_lookup
+from predmapnet.network.state import RigGeometry
+from predmapnet.scenes import Rig
 
 
 def arranged_rig(rig: Rig, config: PredMapNetConfig) -> Rig:

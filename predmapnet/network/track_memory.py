@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from predmapnet.network.interface import Instances, LostTracks, StreamState
+from predmapnet.network.state import Instances, LostTracks, StreamState
 
 
 @dataclass

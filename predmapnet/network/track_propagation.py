@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from mapfusion.elements import ElementKind
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
-from predmapnet.network.bev_history import nearest_pose
 from predmapnet.network.ego_motion import move_points, plane_motion, relative_motion, relative_pose
-from predmapnet.network.interface import StreamState
 from predmapnet.network.layers import Perceptron
-from predmapnet.network.motion_mlp import MotionMlp, pose_vector
+from predmapnet.network.maptracker.bev_memory import nearest_pose
+from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
+from predmapnet.network.maptracker.vector_memory import Recalled, recall
 from predmapnet.network.polylines import clip_polylines
-from predmapnet.network.vector_memory import Recalled, recall
+from predmapnet.network.state import StreamState
 
 
 @dataclass

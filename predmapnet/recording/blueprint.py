@@ -5,7 +5,7 @@ from __future__ import annotations
 import rerun as rr
 import rerun.blueprint as rrb
 
-from predmapnet.datasets.source import Rig
+from predmapnet.scenes import Rig
 
 CAMERA_ORDER = (
     "CAM_FRONT_LEFT",

@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from mapfusion.elements import ElementKind, GlobalMap
-from mapfusion.export.geojson import read_geojson
+from mapfusion.formats.geojson import read_geojson
 from predmapnet.errors import UserError
 from predmapnet.recording.blueprint import WORLD_COORDINATES, map_blueprint
 from predmapnet.recording.palette import KIND_COLOURS

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
-from predmapnet.datasets.source import Camera
+from predmapnet.scenes import Camera
 
 Float = NDArray[np.float64]
 

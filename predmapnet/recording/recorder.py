@@ -15,11 +15,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
-from predmapnet.datasets.source import Camera, Scene
+from predmapnet.map_scene import MapSnapshot, Step
 from predmapnet.recording.blueprint import WORLD_COORDINATES, scene_blueprint
 from predmapnet.recording.palette import KIND_COLOURS, TRUTH_COLOUR, darker, lighter, raster_picture
 from predmapnet.recording.projection import bev_pixels, dashes, project_line
-from predmapnet.streaming import MapSnapshot, Step
+from predmapnet.scenes import Camera, Scene
 
 Float = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ STAGES = {"images": "waiting for images", "network": "network", "integration": "
 
 
 class SceneRecorder:
-    """An observer of :func:`predmapnet.pipeline.map_scene` that draws into a Rerun recording."""
+    """An observer of :func:`predmapnet.runs.infer.map_scene` that draws into a Rerun recording."""
 
     def __init__(self, recording: rr.RecordingStream, description: str, live: bool = False) -> None:
         self._recording = recording

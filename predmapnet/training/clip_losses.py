@@ -15,17 +15,18 @@ from torch.nn import functional
 
 from predmapnet.config import EncoderBevMemoryConfig
 from predmapnet.errors import UserError
-from predmapnet.network.bev_history import keep_map
 from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.interface import FrameInputs, FrameOutputs, ImageFeatures, RigGeometry, StreamState
-from predmapnet.network.maptracker_decoder import MapTrackerDecoder
+from predmapnet.network.maptracker.bev_memory import keep_map
+from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, RigGeometry, StreamState
 from predmapnet.network.track_propagation import PoseTrackPropagation
-from predmapnet.network.tracking import instances_from_rows
+from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.clip_settings import ClipSettings, ClipStage
-from predmapnet.training.depth_targets import UNKNOWN, depth_loss
-from predmapnet.training.losses import focal_loss, forecast_loss, mask_loss, masks_of_size
-from predmapnet.training.maptracker_losses import (
+from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss
+from predmapnet.training.data.targets import Targets
+from predmapnet.training.losses.lite import focal_loss, forecast_loss, mask_loss, masks_of_size
+from predmapnet.training.losses.maptracker import (
     CLASS_WEIGHT,
     LayerTargets,
     all_orders,
@@ -35,10 +36,9 @@ from predmapnet.training.maptracker_losses import (
     stacked,
     transformation_loss,
 )
-from predmapnet.training.matching import Assignment
-from predmapnet.training.ownership import Owners, owned_truth
+from predmapnet.training.losses.matching import Assignment
 from predmapnet.training.pose_noise import with_pose_noise
-from predmapnet.training.targets import Targets
+from predmapnet.training.tracks import Owners, owned_truth
 
 
 @dataclass
@@ -48,7 +48,7 @@ class ClipFrame:
     Attributes:
         inputs: of the network.
         targets: truth, rasters included.
-        depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.training.depth_targets.depth_targets`, or None.
+        depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.training.data.depth_targets.depth_targets`, or None.
     """
 
     inputs: FrameInputs

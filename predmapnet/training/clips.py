@@ -7,21 +7,21 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig, ResNet50Config
-from predmapnet.datasets.source import Rig
-from predmapnet.network.camera_pillars import LEVEL_STRIDES
-from predmapnet.network.image_backbone import STRIDE
 from predmapnet.network.image_input import input_size
-from predmapnet.network.interface import RigGeometry
+from predmapnet.network.maptracker.camera_pillars import LEVEL_STRIDES
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.augmentation import change_light, drop_camera
-from predmapnet.training.batches import RASTER_GRID, Batch, TrainingScenes
-from predmapnet.training.cache import window_camera
+from predmapnet.network.small.backbone import STRIDE
+from predmapnet.network.state import RigGeometry
+from predmapnet.scenes import Rig
 from predmapnet.training.clip_losses import ClipFrame, clip_losses
 from predmapnet.training.clip_settings import ClipStage
-from predmapnet.training.depth_targets import UNKNOWN, depth_targets
+from predmapnet.training.data.augmentation import change_light, drop_camera
+from predmapnet.training.data.batches import RASTER_GRID, Batch, TrainingScenes
+from predmapnet.training.data.depth_targets import UNKNOWN, depth_targets
+from predmapnet.training.data.fill_cache import window_camera
+from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.single_frame import frame_inputs
-from predmapnet.training.targets import truth_targets
 from predmapnet.training.workers import Workers
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import checkpoint
-from predmapnet.training.batches import prefetch
+from predmapnet.training.data.batches import prefetch
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, learning_rate, make_optimiser
 from predmapnet.training.settings import Budget, TrainingSettings
 from predmapnet.training.workers import Workers

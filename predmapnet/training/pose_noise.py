@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.interface import StreamState
+from predmapnet.network.state import StreamState
 
 
 def with_pose_noise(

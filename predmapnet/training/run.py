@@ -12,15 +12,15 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
+from predmapnet.machine import end_with_parent
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import load_config
-from predmapnet.threads import end_with_parent
 from predmapnet.training import checkpoint
-from predmapnet.training.batches import TrainingScenes
-from predmapnet.training.cache import DEMO, cache_folder, fill_demo_cache
 from predmapnet.training.clip_settings import CLIP_STAGES
 from predmapnet.training.clips import ClipTraining
-from predmapnet.training.frames import read_scene
+from predmapnet.training.data.batches import TrainingScenes
+from predmapnet.training.data.fill_cache import DEMO, cache_folder, fill_demo_cache
+from predmapnet.training.data.scene_cache import read_scene
 from predmapnet.training.loop import Trainer
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.single_frame import SingleFrameStage

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.training.augmentation import AugmentationSettings
 from predmapnet.training.clip_settings import ClipSettings, ClipStage, choose_clip_stages, trains_in_clips
-from predmapnet.training.losses import LossWeights
-from predmapnet.training.matching import MatchingCosts
+from predmapnet.training.data.augmentation import AugmentationSettings
+from predmapnet.training.losses.lite import LossWeights
+from predmapnet.training.losses.matching import MatchingCosts
 from predmapnet.training.optimiser import OptimiserSettings
 
 

@@ -7,10 +7,10 @@ from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs, RigGeometry
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.batches import Batch, SingleFrameBatches, TrainingScenes
-from predmapnet.training.losses import frame_losses
+from predmapnet.network.state import FrameInputs, RigGeometry
+from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.losses.lite import frame_losses
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.workers import Workers
 

@@ -15,16 +15,16 @@ from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import instances_from_rows
-from predmapnet.training.batches import TrainingScenes
-from predmapnet.training.losses import forecast_loss, forecast_point_loss, frame_losses
-from predmapnet.training.ownership import Chosen, Owners, choose_tracks, owned_truth
+from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
+from predmapnet.network.track_selection import instances_from_rows
+from predmapnet.training.data.batches import TrainingScenes
+from predmapnet.training.data.streams import Clip, FeatureStore, StreamClips, StreamPlan
+from predmapnet.training.data.targets import Targets
+from predmapnet.training.losses.lite import forecast_loss, forecast_point_loss, frame_losses
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.single_frame import roi_size
-from predmapnet.training.streams import Clip, FeatureStore, StreamClips, StreamPlan
-from predmapnet.training.targets import Targets
+from predmapnet.training.tracks import Chosen, Owners, choose_tracks, owned_truth
 from predmapnet.training.workers import Workers
 
 ENCODE_BATCH = 4

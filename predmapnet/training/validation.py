@@ -13,10 +13,10 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, threshol
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs, RigGeometry
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import select
-from predmapnet.training.frames import CachedScene
+from predmapnet.network.state import FrameInputs, RigGeometry
+from predmapnet.network.track_selection import select
+from predmapnet.training.data.scene_cache import CachedScene
 
 Float = NDArray[np.float64]
 

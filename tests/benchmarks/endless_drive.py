@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from predmapnet.threads import use_threads
+from predmapnet.machine import use_threads
 
 if __name__ == "__main__":  # Before torch is imported.
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -28,11 +28,11 @@ if __name__ == "__main__":  # Before torch is imported.
 import numpy as np
 
 from mapfusion.geometry import inverse_pose
-from mapfusion.integrator import MapIntegrator
-from predmapnet.datasets.demo import DemoSource
-from predmapnet.datasets.source import Frame, Scene
+from mapfusion.integrate.integrator import MapIntegrator
+from predmapnet.demo_world.source import DemoSource
 from predmapnet.mapper import Mapper
-from predmapnet.network.interface import StreamState
+from predmapnet.network.state import StreamState
+from predmapnet.scenes import Frame, Scene
 
 SCENE = "scene-0103"
 METRES_BETWEEN_LAPS = 1000.0

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from statistics import median
 
-from predmapnet.threads import use_threads
+from predmapnet.machine import use_threads
 
 if __name__ == "__main__":  # Before torch is imported.
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -32,11 +32,11 @@ from torch.utils.flop_counter import FlopCounterMode
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import input_size
-from predmapnet.network.inference import for_inference
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Instances, StreamState
-from predmapnet.network.matrix_product import linear
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.kernels.matrix_product import linear
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import instances_from_rows, select
+from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, StreamState
+from predmapnet.network.track_selection import instances_from_rows, select
 from predmapnet.presets import preset
 from tests.benchmarks.part_costs import OF_THE_PAPER, PARTS, THE_REST, Ledger, parameters_of_parts
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mapfusion import ElementKind, FrameMap, MapIntegrator
-from mapfusion.curve import Curve
-from mapfusion.lines import Evidence, FusedLine
+from mapfusion.integrate.curve import Curve
+from mapfusion.integrate.fused_line import Evidence, FusedLine
 from tests.mapfusion.simulation import ROI, pose
 
 pytestmark = pytest.mark.benchmark_only

@@ -15,10 +15,10 @@ import shapely
 
 from mapfusion import ElementKind, GlobalMap, MapElement
 from mapfusion.alignment import move
-from mapfusion.export.plane import LocalPlane
+from mapfusion.formats.by_suffix import read_map, write_map
+from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import arc_length
-from mapfusion.io import read_map, write_map
-from mapfusion.merge import merge_files
+from mapfusion.merge.merge import merge_files
 
 pytestmark = pytest.mark.benchmark_only
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from predmapnet.threads import use_threads
+from predmapnet.machine import use_threads
 from tests.benchmarks import endless_drive, network_cost
 
 pytestmark = pytest.mark.benchmark_only

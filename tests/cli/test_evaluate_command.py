@@ -8,7 +8,7 @@ import pytest
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.evaluation.frames_io import write_frames
+from predmapnet.frame_files.parquet import write_frames
 
 ROI = RegionOfInterest()
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 
-from mapfusion.io import read_map
+from mapfusion.formats.by_suffix import read_map
 from predmapnet.datasets.cameras import NUSCENES_CAMERAS
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.weights.checkpoint import save_checkpoint

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from mapfusion import ElementKind
-from mapfusion.coverage import coverage
-from mapfusion.export.plane import LocalPlane
-from mapfusion.io import read_map
-from predmapnet.evaluation.frames_io import FrameWriter
+from mapfusion.formats.by_suffix import read_map
+from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.ground import coverage
+from predmapnet.frame_files.parquet import FrameWriter
 from tests.mapfusion.simulation import town_drive
 
 ORIGIN = "49.0,8.4"

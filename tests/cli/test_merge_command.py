@@ -5,8 +5,8 @@ import json
 import numpy as np
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.export.plane import LocalPlane
-from mapfusion.io import read_map, write_map
+from mapfusion.formats.by_suffix import read_map, write_map
+from mapfusion.formats.local_plane import LocalPlane
 
 PLANE = LocalPlane(8.4, 49.0)
 

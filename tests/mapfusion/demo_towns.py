@@ -9,12 +9,12 @@ from pathlib import Path
 import shapely
 
 from mapfusion.elements import FrameMap, GlobalMap
-from predmapnet.datasets.demo import DemoSource
-from predmapnet.evaluation.frames_io import read_frames
+from predmapnet.demo_world.source import DemoSource
 from predmapnet.evaluation.global_map import seen_area
+from predmapnet.frame_files.parquet import read_frames
 from predmapnet.mapper import Mapper
-from predmapnet.outputs import Outputs
-from predmapnet.pipeline import MappingPipeline
+from predmapnet.runs.infer import MappingPipeline
+from predmapnet.runs.outputs import Outputs
 from predmapnet.weights.files import weights_hash
 
 

@@ -10,9 +10,9 @@ import shapely
 import shapely.ops
 from numpy.typing import NDArray
 
-from mapfusion.coverage import ground_within
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
+from mapfusion.ground import ground_within
 from mapfusion.visibility import CameraSector, visible_ground
 
 Float = NDArray[np.float64]

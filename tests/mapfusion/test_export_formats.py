@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.export.plane import LocalPlane, common_plane
-from mapfusion.export.qgis_style import write_styles
-from mapfusion.io import MapWriter, read_box, read_map, write_map
+from mapfusion.formats.by_suffix import MapWriter, read_box, read_map, write_map
+from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.formats.qgis_style import write_styles
 
 PLANE = LocalPlane(-71.05, 42.34, "harbour")
 FORMATS = ("map.geojson", "map.gpkg", "map.fgb", "map.osm")

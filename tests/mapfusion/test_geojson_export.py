@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.export.geojson import format_timestamp, parse_timestamp, read_geojson, write_geojson
+from mapfusion.formats.geojson import format_timestamp, parse_timestamp, read_geojson, write_geojson
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mapfusion import RegionOfInterest
-from mapfusion.contour import level_polygons
 from mapfusion.geometry import arc_length, chamfer_distance, clip_line, inverse_pose, resample, transform_points
-from mapfusion.tidy import tidy
+from mapfusion.level_lines import level_polygons
+from mapfusion.tidying import tidy
 from tests.mapfusion.simulation import pose
 
 coordinate = st.floats(-100, 100, width=32)

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, IntegratorConfig, MapElement, MapIntegrator, RegionOfInterest
-from mapfusion.joining import join
-from mapfusion.tidy import hairpins
-from mapfusion.views import ViewGrid
+from mapfusion.integrate.joining import join
+from mapfusion.integrate.views import ViewGrid
+from mapfusion.tidying import hairpins
 from mapfusion.visibility import CameraSector, visible_ground
 from tests.mapfusion.map_quality import dense, faults, nearest
 from tests.mapfusion.simulation import ROI, pose, town_drive

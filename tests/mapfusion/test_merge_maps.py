@@ -10,13 +10,13 @@ import shapely
 
 from mapfusion import ElementKind, GlobalMap, MapElement, MapIntegrator, merge_lines
 from mapfusion.alignment import align, landmarks, move
-from mapfusion.coverage import RIM, coverage, near_elements, observed_rings
-from mapfusion.export.plane import LocalPlane
+from mapfusion.formats.by_suffix import read_map, write_map
+from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import arc_length
-from mapfusion.io import read_map, write_map
-from mapfusion.merge import merge_files, merge_maps
-from mapfusion.merge_lines import MergeConfig
-from mapfusion.merge_report import short_names
+from mapfusion.ground import RIM, coverage, near_elements, observed_rings
+from mapfusion.merge.lines import MergeConfig
+from mapfusion.merge.merge import merge_files, merge_maps
+from mapfusion.merge.report import short_names
 from tests.mapfusion.map_quality import measure
 from tests.mapfusion.simulation import simulate, town_road
 from tests.mapfusion.test_integrator_properties import frame_map

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from mapfusion.elements import ElementKind
 from mapfusion.geometry import arc_length
+from mapfusion.merge.tiles import Piece, Stitcher, cut_line, tiles_of
 from mapfusion.stretches import pair, sample_lines
-from mapfusion.tiles import Piece, Stitcher, cut_line, tiles_of
 
 spots = st.tuples(st.floats(-300, 300), st.floats(-300, 300))
 paths = st.lists(spots, min_size=2, max_size=8, unique=True).map(lambda p: np.array(p, dtype=np.float64))

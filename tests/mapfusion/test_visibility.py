@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator
-from mapfusion.coverage import ground_within
 from mapfusion.geometry import transform_points
+from mapfusion.ground import ground_within
 from mapfusion.visibility import CameraSector, frame_ground, visible_ground
 from tests.mapfusion.map_quality import dense, nearest
 from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, ROI, Detector, element, pose, simulate

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from mapfusion.integrator import MapIntegrator
-from predmapnet.datasets.demo import DemoSource
+from mapfusion.integrate.integrator import MapIntegrator
+from predmapnet.demo_world.source import DemoSource
 from predmapnet.mapper import Mapper
 from tests.benchmarks.endless_drive import SCENE, drive, endless_frames
 

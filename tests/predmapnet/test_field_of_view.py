@@ -9,10 +9,10 @@ import pytest
 import shapely
 
 from mapfusion import RegionOfInterest
-from mapfusion.coverage import ground_within
-from predmapnet.datasets.source import Camera, Frame
+from mapfusion.ground import ground_within
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.field_of_view import sector_of, seen_by, seen_in
+from predmapnet.scenes import Camera, Frame
 
 ROI = RegionOfInterest()
 

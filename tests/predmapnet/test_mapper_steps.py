@@ -9,12 +9,12 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.cameras import NUSCENES_CAMERAS
-from predmapnet.datasets.source import Frame
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.mapper import Mapper
-from predmapnet.network.interface import StreamState
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import StreamState
+from predmapnet.scenes import Frame
 from tests.predmapnet.network.small_baseline import small_config
 
 SMALL = {

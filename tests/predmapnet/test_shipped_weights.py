@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from mapfusion.integrator import MapIntegrator
+from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.ground_truth import truth_from_vector_map
 from predmapnet.datasets.ground_truth.whole_map import truth_map
@@ -12,8 +12,8 @@ from predmapnet.demo_world.catalogue import trajectory, vector_map
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.cache import cache_demo_scene
-from predmapnet.training.frames import CachedScene, read_scene
+from predmapnet.training.data.fill_cache import cache_demo_scene
+from predmapnet.training.data.scene_cache import CachedScene, read_scene
 from predmapnet.training.validation import map_frames, validate
 from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED

@@ -40,8 +40,8 @@ from predmapnet.datasets.ground_truth.patch import (
     patch_polygon,
 )
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
+from predmapnet.scenes import FrameTruth
 
 Float = NDArray[np.float64]
 

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from mapfusion import geometry
 from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets import poses as poses_module
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
+from predmapnet.scenes import FrameTruth
 
 Float = NDArray[np.float64]
 

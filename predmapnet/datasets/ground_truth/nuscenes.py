@@ -31,9 +31,9 @@ from predmapnet.datasets.ground_truth.patch import (
     rotation_about,
 )
 from predmapnet.datasets.poses import quaternion_of, rotation_matrix
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.demo_world.world import VectorMap
 from predmapnet.errors import UserError
+from predmapnet.scenes import FrameTruth
 
 Float = NDArray[np.float64]
 Records = list[dict[str, Any]]

@@ -13,7 +13,7 @@ from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.ground_truth.raster import Mask, instance_masks, mask_iou
 from predmapnet.datasets.ground_truth.vectors import normalised, resampled
-from predmapnet.datasets.source import FrameTruth
+from predmapnet.scenes import FrameTruth
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]

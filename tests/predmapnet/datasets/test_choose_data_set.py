@@ -2,8 +2,8 @@
 
 import pytest
 
-from predmapnet.datasets.selection import open_source
 from predmapnet.errors import UserError
+from predmapnet.sources import open_source
 
 VARIABLES = ("PREDMAPNET_DATASET", "PREDMAPNET_DATA_ROOT", "NUSCENES_ROOT", "AV2_ROOT")
 

@@ -9,16 +9,16 @@ import shapely
 from shapely import Polygon, box
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.datasets.source import Camera
 from predmapnet.demo_world.av2_dressing import read_log
 from predmapnet.demo_world.catalogue import build_world
-from predmapnet.demo_world.dressing import dress
-from predmapnet.demo_world.lidar import RANGE, scan
 from predmapnet.demo_world.occlusion import hidden_share
-from predmapnet.demo_world.renderer import Renderer
+from predmapnet.demo_world.render.lidar import RANGE, scan
+from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.demo_world.traffic import footprint
+from predmapnet.demo_world.street.dressing import dress
+from predmapnet.demo_world.street.traffic import footprint
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Look, Trajectory, VectorMap
+from predmapnet.scenes import Camera
 
 SMALL_RIG = tuple(
     Camera(camera.name, 256, 144, np.diag([0.32, 0.32, 1.0]) @ camera.intrinsics, camera.camera_to_ego)

@@ -8,9 +8,9 @@ import pytest
 import shapely
 
 from predmapnet.demo_world.catalogue import build_world, scene_folder, vector_map
-from predmapnet.demo_world.nuscenes_map import build_expansion, draw_prior
-from predmapnet.demo_world.nuscenes_tables import build_tables
-from predmapnet.demo_world.nuscenes_writer import write_scene
+from predmapnet.demo_world.nuscenes.map_expansion import build_expansion, draw_prior
+from predmapnet.demo_world.nuscenes.tables import build_tables
+from predmapnet.demo_world.nuscenes.writer import write_scene
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.demo_world.world import Trajectory
 from predmapnet.errors import UserError

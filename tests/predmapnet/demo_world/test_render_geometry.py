@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from shapely import box
 
-from predmapnet.datasets.source import Camera
-from predmapnet.demo_world.renderer import Renderer
+from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.demo_world.solid_list import SolidList
+from predmapnet.demo_world.street.solid_list import SolidList
 from predmapnet.demo_world.world import Divider, LineStyle, Look, Surface, Trajectory, VectorMap, World
+from predmapnet.scenes import Camera
 
 FRONT = DEMO_RIG[0]
 LINES = {

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mapfusion.elements import FrameMap, RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.scenes import FrameTruth
 
 PROJECT = Path(__file__).parents[3]
 BUNDLED = PROJECT / "tests" / "data" / "metrics"

@@ -10,8 +10,8 @@ import pytest
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
-from predmapnet.evaluation.frames_io import FrameWriter, read_frames, stored_scenes, write_frames
-from predmapnet.evaluation.submission import read_submission
+from predmapnet.frame_files.parquet import FrameWriter, read_frames, stored_scenes, write_frames
+from predmapnet.frame_files.submission import read_submission
 
 
 def frame_map(count, generator, forecasts=True):

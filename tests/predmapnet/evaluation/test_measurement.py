@@ -9,10 +9,10 @@ import pytest
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import transform_points
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import measure_scene, pool_scenes
 from predmapnet.evaluation.report import write_figures, write_report
+from predmapnet.scenes import FrameTruth
 
 RING = np.array([[10.0, -3.0], [14.0, -3.0], [14.0, 5.0], [10.0, 5.0], [10.0, -3.0]])
 CONTEXT = {"dataset": "demo", "split": "test", "synthetic": True}

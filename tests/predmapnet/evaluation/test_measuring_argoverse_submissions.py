@@ -10,7 +10,7 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.errors import UserError
 from predmapnet.evaluation.measurement import pool_scenes
-from predmapnet.evaluation.runs import EvaluationSettings, measure_scenes, scenes_to_measure
+from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, scenes_to_measure
 
 pytestmark = pytest.mark.reference
 

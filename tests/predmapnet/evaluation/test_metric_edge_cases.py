@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision
 from predmapnet.evaluation.consistency_ap import consistency_average_precision, with_formed_tracks
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import measure_scene, pool_scenes
 from predmapnet.evaluation.raster_ap import raster_average_precision
+from predmapnet.scenes import FrameTruth
 
 HERE, THERE = [[-20.0, 3.0], [20.0, 5.0]], [[-20.0, -9.0], [20.0, -8.0]]
 RING = [[2.0, -4.0], [6.0, -4.0], [6.0, 4.0], [2.0, 4.0], [2.0, -4.0]]

@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
 from predmapnet.evaluation.consistency_ap import consistency_average_precision, with_formed_tracks
 from predmapnet.evaluation.frames import EvaluationFrame, simplified
 from predmapnet.evaluation.raster_ap import raster_average_precision
+from predmapnet.scenes import FrameTruth
 
 METRICS = (chamfer_average_precision, consistency_average_precision, raster_average_precision)
 

@@ -7,9 +7,9 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.interface import FrameInputs
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.view_transform import RigLookup
+from predmapnet.network.small.ground_lookup import RigLookup
+from predmapnet.network.state import FrameInputs
 
 SMALL = {
     "image": {"width": 64, "height": 24},

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.camera_pillars import CameraPillars, make_camera_pillars
-from predmapnet.network.interface import FrameInputs
+from predmapnet.network.maptracker.camera_pillars import CameraPillars, make_camera_pillars
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import FrameInputs
 from predmapnet.weights.maptracker_import import import_maptracker
 
 PROJECT = Path(__file__).resolve().parents[3]

@@ -5,10 +5,10 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.camera_pillars import CameraPillars, make_camera_pillars
-from predmapnet.network.interface import FrameInputs
+from predmapnet.network.maptracker.camera_pillars import CameraPillars, make_camera_pillars
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import select
+from predmapnet.network.state import FrameInputs
+from predmapnet.network.track_selection import select
 from predmapnet.presets import preset
 
 SIZE = (64, 96)

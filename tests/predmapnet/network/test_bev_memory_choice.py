@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from predmapnet.network.temporal_bev import remember_bev
+from predmapnet.network.small.bev_memory import remember_bev
 
 SPACING = 2.0
 

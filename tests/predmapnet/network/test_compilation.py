@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from predmapnet.errors import UserError
-from predmapnet.network.compilation import compile_features
-from predmapnet.network.inference import for_inference
-from predmapnet.network.tracking import select
+from predmapnet.network.kernels.compilation import compile_features
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.track_selection import select
 from tests.predmapnet.network.test_low_precision import case
 
 

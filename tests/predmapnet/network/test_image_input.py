@@ -18,9 +18,7 @@ from predmapnet.config import ImageWindowConfig, PredMapNetConfig, WholeImageCon
 from predmapnet.datasets.argoverse2 import GROUND_HEIGHT, Argoverse2Source
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.datasets.source import Camera
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.camera_pillars import project_pillars
 from predmapnet.network.image_input import (
     crop_image,
     ego_to_image,
@@ -29,8 +27,10 @@ from predmapnet.network.image_input import (
     normalise_images,
     stack_windows,
 )
-from predmapnet.network.view_transform import make_rig_lookup
+from predmapnet.network.maptracker.camera_pillars import project_pillars
+from predmapnet.network.small.ground_lookup import make_rig_lookup
 from predmapnet.presets import preset
+from predmapnet.scenes import Camera
 from tests.predmapnet.network.maptracker_reference import FOLDER
 
 WHOLE = WholeImageConfig()

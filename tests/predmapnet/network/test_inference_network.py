@@ -4,9 +4,9 @@ import torch
 from torch import nn
 
 from predmapnet.config import SmallBackboneConfig
-from predmapnet.network.image_backbone import ImageBackbone
-from predmapnet.network.inference import for_inference
-from predmapnet.network.resnet import ResNet50
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.maptracker.resnet import ResNet50
+from predmapnet.network.small.backbone import ImageBackbone
 
 
 def with_any_statistics(network: nn.Module) -> nn.Module:

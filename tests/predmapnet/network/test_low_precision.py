@@ -5,10 +5,10 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.inference import for_inference
-from predmapnet.network.interface import FrameInputs
-from predmapnet.network.low_precision import in_precision
-from predmapnet.network.tracking import select
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.kernels.low_precision import in_precision
+from predmapnet.network.state import FrameInputs
+from predmapnet.network.track_selection import select
 from predmapnet.precision import Precision
 from tests.predmapnet.network.conftest import SMALL
 from tests.predmapnet.network.small_baseline import frames, small_config, small_network, small_pillars

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.network.motion_mlp import MotionMlp
-from predmapnet.network.vector_memory import empty_vector_memory, recall, remember
+from predmapnet.network.maptracker.motion_mlp import MotionMlp
+from predmapnet.network.maptracker.vector_memory import empty_vector_memory, recall, remember
 from predmapnet.presets import preset
 from tests.predmapnet.network.maptracker_reference import FOLDER, difference, load_reference, pose
 

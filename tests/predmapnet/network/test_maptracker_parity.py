@@ -8,12 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from predmapnet.network.bev_history import BevHistory, look_back
-from predmapnet.network.camera_pillars import CameraPillars, project_pillars
-from predmapnet.network.interface import FrameInputs, FrameOutputs, Selection, StreamState
+from predmapnet.network.maptracker.bev_memory import BevHistory, look_back
+from predmapnet.network.maptracker.camera_pillars import CameraPillars, project_pillars
+from predmapnet.network.maptracker.vector_memory import age_code, recall
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import select
-from predmapnet.network.vector_memory import age_code, recall
+from predmapnet.network.state import FrameInputs, FrameOutputs, Selection, StreamState
+from predmapnet.network.track_selection import select
 from tests.predmapnet.network.maptracker_reference import FOLDER, Reference, difference, load_reference, recorded
 
 pytestmark = pytest.mark.reference

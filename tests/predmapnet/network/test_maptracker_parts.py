@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from predmapnet.config import ALL_QUIRKS, MapTrackerQuirks
-from predmapnet.network.bev_history import warp_grid
-from predmapnet.network.deformable_attention import deformable_attention
-from predmapnet.network.deformable_convolution import DeformableConvolution
 from predmapnet.network.ego_motion import invert_pose, quaternion
 from predmapnet.network.history_choice import choose_history
-from predmapnet.network.normalised_convolution import NormalisedConvolution
+from predmapnet.network.kernels.deformable_attention import deformable_attention
+from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
+from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
+from predmapnet.network.maptracker.bev_memory import warp_grid
 from tests.predmapnet.network.small_baseline import (
     frames,
     small_config,

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from predmapnet.network.matrix_product import MANY_ROWS, Linear, linear
+from predmapnet.network.kernels.matrix_product import MANY_ROWS, Linear, linear
 
 
 @pytest.mark.parametrize("shape", [(2, MANY_ROWS), (1, 50, 100), (3, 1009), (7,), (0,), (4, 0)])

@@ -7,17 +7,17 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.interface import BevFeatures
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import select
-from predmapnet.training.batches import Batch
+from predmapnet.network.state import BevFeatures
+from predmapnet.network.track_selection import select
 from predmapnet.training.clip_losses import clip_losses
 from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import clip_frame
+from predmapnet.training.data.batches import Batch
+from predmapnet.training.data.streams import Clip, StreamPlan
+from predmapnet.training.data.targets import Targets
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
 from predmapnet.training.settings import StreamSettings, TrainingSettings
-from predmapnet.training.streams import Clip, StreamPlan
-from predmapnet.training.targets import Targets
 from predmapnet.training.temporal import TemporalStage
 from predmapnet.training.workers import Workers
 from tests.predmapnet.network.conftest import SMALL

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from predmapnet.config import MapTrackerQuirks
-from predmapnet.network.interface import StreamState
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import instances_from_rows
+from predmapnet.network.state import StreamState
+from predmapnet.network.track_selection import instances_from_rows
 from tests.predmapnet.network.small_baseline import frames, small_config, small_network, small_pillars, step, together
 
 OFF = {

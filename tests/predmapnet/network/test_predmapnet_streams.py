@@ -8,7 +8,7 @@ import torch
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.tracking import instances_from_rows
+from predmapnet.network.track_selection import instances_from_rows
 from tests.predmapnet.network.conftest import SMALL
 
 MODULES = {

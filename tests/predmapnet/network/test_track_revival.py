@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.interface import FrameInputs, FrameOutputs, LayerPredictions, StreamState
 from predmapnet.network.polylines import clip_polylines
 from predmapnet.network.revival import point_line_distances
-from predmapnet.network.tracking import select
+from predmapnet.network.state import FrameInputs, FrameOutputs, LayerPredictions, StreamState
+from predmapnet.network.track_selection import select
 from predmapnet.training.temporal import detached, forget
 
 ROI = torch.tensor([60.0, 30.0])

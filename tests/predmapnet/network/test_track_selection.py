@@ -3,8 +3,8 @@
 import torch
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.interface import FrameOutputs, Instances, LayerPredictions
-from predmapnet.network.tracking import select
+from predmapnet.network.state import FrameOutputs, Instances, LayerPredictions
+from predmapnet.network.track_selection import select
 
 ROI = torch.tensor([60.0, 30.0])
 

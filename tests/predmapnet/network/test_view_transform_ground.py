@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.image_backbone import STRIDE
 from predmapnet.network.image_input import crop_image, image_window, mirror_order, mirror_rig
 from predmapnet.network.layers import cell_centres
-from predmapnet.network.view_transform import make_rig_lookup, to_ground
+from predmapnet.network.small.backbone import STRIDE
+from predmapnet.network.small.ground_lookup import make_rig_lookup, to_ground
 from predmapnet.presets import preset
 
 CONFIG = preset("lite")

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
-from predmapnet.datasets.source import Camera
 from predmapnet.recording.palette import KIND_COLOURS, raster_picture
 from predmapnet.recording.projection import bev_pixels, dashes, densify, project_line, runs
+from predmapnet.scenes import Camera
 
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Camera axes (x right, y down, z forward) in the ego frame of a camera that looks ahead."""

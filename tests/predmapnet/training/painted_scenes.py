@@ -10,11 +10,11 @@ import numpy as np
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import clip_line, inverse_pose, resample, transform_points
 from predmapnet.config import PredMapNetConfig
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.presets import preset
-from predmapnet.training.frames import CachedScene, read_scene, write_scene
+from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.scene_cache import CachedScene, read_scene, write_scene
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))
 

@@ -12,10 +12,10 @@ from tiny_clips import tiny_paper_config
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
-from predmapnet.training.batches import TrainingScenes
 from predmapnet.training.clip_settings import BEV_PARTS, CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import ClipTraining, ImageClips
-from predmapnet.training.depth_targets import UNKNOWN
+from predmapnet.training.data.batches import TrainingScenes
+from predmapnet.training.data.depth_targets import UNKNOWN
 from predmapnet.training.loop import Trainer
 from predmapnet.training.optimiser import make_optimiser
 from predmapnet.training.settings import Budget, plan_run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.training.maptracker_losses import (
+from predmapnet.training.losses.maptracker import (
     CLASS_WEIGHT,
     LINE_WEIGHT,
     all_orders,

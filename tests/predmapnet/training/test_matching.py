@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
-from predmapnet.training.matching import MatchingCosts, best_order, curve_cost, focal_class_cost, match
-from predmapnet.training.targets import equivalent_orders, truth_targets
+from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.targets import equivalent_orders, truth_targets
+from predmapnet.training.losses.matching import MatchingCosts, best_order, curve_cost, focal_class_cost, match
 
 ROI = RegionOfInterest()
 SIZE = torch.tensor([60.0, 30.0])

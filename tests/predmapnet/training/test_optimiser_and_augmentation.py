@@ -8,10 +8,10 @@ import torch
 from torch import nn
 
 from mapfusion.geometry import inverse_pose
-from predmapnet.datasets.source import FrameTruth
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import mirror_order
-from predmapnet.training.augmentation import (
+from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.augmentation import (
     AugmentationSettings,
     change_light,
     mirror_images,

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
-from predmapnet.network.interface import FrameOutputs, LayerPredictions
-from predmapnet.training.losses import LossWeights, frame_losses
-from predmapnet.training.matching import Assignment, MatchingCosts
-from predmapnet.training.ownership import Owners, choose_tracks, owned_truth
+from predmapnet.network.state import FrameOutputs, LayerPredictions
+from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.targets import Targets, truth_targets
+from predmapnet.training.losses.lite import LossWeights, frame_losses
+from predmapnet.training.losses.matching import Assignment, MatchingCosts
 from predmapnet.training.settings import StreamSettings
-from predmapnet.training.targets import Targets, truth_targets
+from predmapnet.training.tracks import Owners, choose_tracks, owned_truth
 
 ROI = RegionOfInterest()
 SIZE = torch.tensor([60.0, 30.0])

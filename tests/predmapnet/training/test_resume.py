@@ -15,7 +15,7 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import checkpoint
-from predmapnet.training.batches import TrainingScenes
+from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
 from predmapnet.training.run import RunOptions, train
 from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.source import FrameTruth
-from predmapnet.training.targets import draw_element, truth_targets
+from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.targets import draw_element, truth_targets
 
 ROI = RegionOfInterest(60.0, 30.0)
 

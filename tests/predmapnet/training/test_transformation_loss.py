@@ -5,9 +5,9 @@ import torch
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.network.ego_motion import move_points, plane_motion
-from predmapnet.network.motion_mlp import MotionMlp
-from predmapnet.training.losses import focal_loss
-from predmapnet.training.maptracker_losses import CLASS_WEIGHT, TRANSFORMATION_WEIGHT, transformation_loss
+from predmapnet.network.maptracker.motion_mlp import MotionMlp
+from predmapnet.training.losses.lite import focal_loss
+from predmapnet.training.losses.maptracker import CLASS_WEIGHT, TRANSFORMATION_WEIGHT, transformation_loss
 
 ROI = RegionOfInterest()
 POINTS, BACKGROUND = 4, 3

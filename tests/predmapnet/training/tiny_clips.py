@@ -10,11 +10,11 @@ from painted_scenes import painted_scene
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
-from predmapnet.network.interface import FrameInputs
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import FrameInputs
 from predmapnet.presets import preset
 from predmapnet.training.clip_losses import ClipFrame
-from predmapnet.training.targets import truth_targets
+from predmapnet.training.data.targets import truth_targets
 
 GRID = (100, 200)
 

@@ -1,1 +1,0 @@
-"""Writers and readers of global maps, one file per format."""

@@ -1,0 +1,190 @@
+"""Maps to and from files; the format is chosen by the name's ending."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import GlobalMap, MapElement
+from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
+from mapfusion.formats.geojson import GeoJsonWriter, Georeference, InvertibleGeoreference, read_geojson, write_geojson
+from mapfusion.formats.lanelet2 import read_lanelet, write_lanelet
+from mapfusion.formats.local_plane import LocalPlane, common_plane
+
+Float = NDArray[np.float64]
+
+SUFFIXES = {
+    ".geojson": "GeoJSON",
+    ".json": "GeoJSON",
+    ".gpkg": "GeoPackage",
+    ".fgb": "FlatGeobuf",
+    ".osm": "Lanelet2",
+}
+"""Endings of the files that hold maps, and what each is."""
+
+
+def check_suffix(path: Path) -> None:
+    """Raise ValueError for a name whose ending stands for no format."""
+    if path.suffix.lower() not in SUFFIXES:
+        endings = ", ".join(f"{suffix} ({name})" for suffix, name in SUFFIXES.items())
+        raise ValueError(f"{path}: the ending '{path.suffix}' stands for no map format; use one of {endings}")
+
+
+def write_map(
+    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+) -> None:
+    """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
+
+    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.01 mm, deviations to
+    1 mm and confidences to 0.0001. Rings turn counter-clockwise. :func:`read_map` gives it back.
+
+    Args:
+        global_map: elements in the metric global frame.
+        path: file to write; an existing one is replaced.
+        georeference: of that frame.
+        provenance: what else the file should tell of its origin.
+
+    Raises:
+        ValueError: an ending that stands for no format, or coordinates not on the globe.
+        OSError: the file cannot be written.
+    """
+    check_suffix(path)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            write_geodatabase(global_map, path, georeference, provenance)
+        case "Lanelet2":
+            write_lanelet(global_map, path, georeference, provenance)
+        case _:
+            write_geojson(global_map, path, georeference, provenance)
+
+
+class MapWriter:
+    """Writes a map element by element; GeoJSON as they come, other formats at the end.
+
+    Use it as a context manager. An exception inside leaves no file.
+
+    Args:
+        path: file to write; its ending says the format.
+        georeference: of the metric frame.
+        provenance: what the file should tell of its origin.
+
+    Raises:
+        ValueError: an ending that stands for no format.
+    """
+
+    def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
+        check_suffix(path)
+        self._path, self._georeference, self._provenance = path, georeference, provenance
+        self._stream = (
+            GeoJsonWriter(path, georeference, provenance) if SUFFIXES[path.suffix.lower()] == "GeoJSON" else None
+        )
+        self._elements: list[MapElement] = []
+
+    def __enter__(self) -> Self:
+        if self._stream is not None:
+            self._stream.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stream is not None:
+            self._stream.__exit__(kind, error, trace)
+        elif kind is None:
+            write_map(GlobalMap(tuple(self._elements), self._provenance), self._path, self._georeference)
+
+    def write(self, element: MapElement) -> None:
+        """Append one element."""
+        if self._stream is not None:
+            self._stream.write(element)
+        else:
+            self._elements.append(element)
+
+
+def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
+    """Read a map that :func:`write_map` wrote.
+
+    Args:
+        path: the file.
+        georeference: leads to the metric frame; without one the map is in metres about the middle of its bounds.
+
+    Raises:
+        ValueError: an ending that stands for no format, or a file that is not as it should be.
+        OSError: the file cannot be read.
+    """
+    check_suffix(path)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            return read_geodatabase(path, georeference)
+        case "Lanelet2":
+            return read_lanelet(path, georeference)
+        case _:
+            return read_geojson(path, georeference)
+
+
+def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
+    """Read maps of one place into one metric plane.
+
+    Returns:
+        The maps, in the order of the paths, and the plane.
+
+    Raises:
+        ValueError, OSError: as :func:`read_map`, or the maps lie too far apart.
+    """
+    boxes = [box for box in (read_box(path) for path in paths) if box is not None]
+    plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
+    return [read_map(path, plane) for path in paths], plane
+
+
+def read_box(path: Path) -> Float | None:
+    """Return west, south, east and north of a map, degrees, without reading all of it; None if it is empty.
+
+    Raises:
+        ValueError, OSError: as :func:`read_map`.
+    """
+    check_suffix(path)
+    match SUFFIXES[path.suffix.lower()]:
+        case "GeoPackage" | "FlatGeobuf":
+            box = geodatabase_box(path)
+        case "Lanelet2":
+            box = _box_of_points(path)
+        case _:
+            with path.open(encoding="utf-8") as file:
+                head = file.read(512)
+            found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
+            box = json.loads(found[1]) if found else _box_of_points(path)
+    if box is None:
+        return None
+    if len(box) != 4 or not np.isfinite(box).all():
+        raise ValueError(f"{path}: the bounding box is not four numbers: {box}")
+    if not (np.abs(box) <= [180.0, 90.0, 180.0, 90.0]).all():
+        raise ValueError(f"{path}: the positions are not longitude and latitude in degrees (WGS84): {box}")
+    return np.array(box, dtype=np.float64)
+
+
+def _box_of_points(path: Path) -> list[float] | None:
+    """The bounds of a file that does not begin with them."""
+    elements = read_map(path, _Degrees()).elements
+    if not elements:
+        return None
+    points = np.concatenate([element.points for element in elements])
+    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+
+
+class _Degrees:
+    """Leaves longitude and latitude as they are."""
+
+    name = "degrees"
+
+    def to_wgs84(self, points: Float) -> Float:
+        return points
+
+    def from_wgs84(self, points: Float) -> Float:
+        return points

@@ -1,0 +1,129 @@
+"""OSM XML with the tags of Lanelet2: the physical layer only, as a map of lines is no map of lanes.
+
+Dividers become ways of type ``line_thin``, boundaries ``road_border`` and crossings closed ways
+``pedestrian_marking`` (Lanelet2's documentation, LinestringTagging). Whether a divider is solid or dashed is not known,
+so there is no subtype. Nodes have latitude, longitude and, as ``local_x`` and ``local_y``, metres of the map's own
+frame. What else is known of an element stands in tags that begin with ``predmapnet:``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import shapely
+
+from mapfusion.elements import ElementKind, GlobalMap, MapElement
+from mapfusion.formats.geojson import (
+    Georeference,
+    InvertibleGeoreference,
+    elements_of,
+    feature_of,
+    origin_of,
+    write_whole,
+)
+
+TYPES = {
+    ElementKind.PED_CROSSING: "pedestrian_marking",
+    ElementKind.DIVIDER: "line_thin",
+    ElementKind.BOUNDARY: "road_border",
+}
+PREFIX = "predmapnet:"
+
+
+def write_lanelet(
+    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+) -> None:
+    """Write a map as OSM XML (``.osm``); complete or not at all.
+
+    Raises:
+        ValueError: coordinates that are not on the globe.
+        OSError: the file cannot be written.
+    """
+    origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
+    with write_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(
+            '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" upload="false" generator="predmapnet">\n'
+        )
+        file.write(f"  <meta provenance={quoteattr(json.dumps(origin, allow_nan=False))}/>\n")
+        ways: list[str] = []
+        number = 0
+        for element in global_map:
+            first = number + 1
+            feature = feature_of(element, georeference)
+            for line in _nodes(element, feature, first):
+                file.write(line)
+                number += 1
+            ways.append(_way(element.kind, feature, first, number))
+        for way_number, way in enumerate(ways, start=number + 1):
+            file.write(f'  <way id="{way_number}" visible="true" version="1">\n{way}  </way>\n')
+        file.write("</osm>\n")
+
+
+def read_lanelet(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
+    """Read a map that :func:`write_lanelet` wrote; see :func:`mapfusion.formats.geojson.read_geojson`.
+
+    Raises:
+        ValueError: not a file of ours; says where it breaks.
+        OSError: the file cannot be read.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path}: not XML: {error}") from error
+    if root.tag != "osm":
+        raise ValueError(f"{path}: not OSM XML: the root is <{root.tag}>")
+    try:
+        positions = {
+            node.attrib["id"]: (float(node.attrib["lon"]), float(node.attrib["lat"])) for node in root.iter("node")
+        }
+        features = [_feature(way, positions) for way in root.iter("way")]
+        meta = root.find("meta")
+        origin = json.loads(meta.attrib["provenance"]) if meta is not None else {}
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: not a map of ours: {error!r}") from error
+    table = np.array(list(positions.values())).reshape(-1, 2)
+    box = [*table.min(axis=0), *table.max(axis=0)] if len(table) else None
+    return GlobalMap(elements_of(features, georeference, box, path), origin)
+
+
+def _nodes(element: MapElement, feature: Mapping[str, Any], first: int) -> Iterator[str]:
+    ring = element.kind.is_ring
+    positions = feature["geometry"]["coordinates"][0][:-1] if ring else feature["geometry"]["coordinates"]
+    local = element.points[:-1] if ring else element.points
+    if ring and not shapely.LinearRing(element.points).is_ccw:
+        local = element.points[::-1][:-1]
+    for number, ((longitude, latitude), (x, y)) in enumerate(zip(positions, local.tolist(), strict=True), start=first):
+        yield (
+            f'  <node id="{number}" visible="true" version="1" lat="{latitude!r}" lon="{longitude!r}">\n'
+            f'    <tag k="local_x" v="{x:.4f}"/>\n    <tag k="local_y" v="{y:.4f}"/>\n  </node>\n'
+        )
+
+
+def _way(kind: ElementKind, feature: Mapping[str, Any], first: int, last: int) -> str:
+    references = [*range(first, last + 1), *([first] if kind.is_ring else [])]
+    tags = {"type": TYPES[kind], **{PREFIX + key: _text(value) for key, value in feature["properties"].items()}}
+    nodes = "".join(f'    <nd ref="{reference}"/>\n' for reference in references)
+    return nodes + "".join(f"    <tag k={quoteattr(key)} v={quoteattr(value)}/>\n" for key, value in tags.items())
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _feature(way: ElementTree.Element, positions: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    points = [positions[reference.attrib["ref"]] for reference in way.iter("nd")]
+    properties: dict[str, Any] = {}
+    for tag in way.iter("tag"):
+        key, value = tag.attrib["k"], tag.attrib["v"]
+        if key.startswith(PREFIX):
+            name = key.removeprefix(PREFIX)
+            properties[name] = value if name in ("kind", "first_seen", "last_seen") else json.loads(value)
+    ring = properties.get("kind") == ElementKind.PED_CROSSING.label
+    geometry = {"type": "Polygon", "coordinates": [points]} if ring else {"type": "LineString", "coordinates": points}
+    return {"geometry": geometry, "properties": properties}

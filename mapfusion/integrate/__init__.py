@@ -1,0 +1,1 @@
+"""Tracked polylines of single frames into one global map."""

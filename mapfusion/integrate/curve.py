@@ -1,0 +1,82 @@
+"""Stations along a line and what is known at each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Marks = NDArray[np.uint64]
+
+INFORMATION, SEEN, SEEN_VIEW, OBSERVATIONS, SCATTER = range(5)
+"""Columns of :attr:`Curve.sums`."""
+
+PLACES, TRACKS = range(2)
+"""Columns of :attr:`Curve.marks`."""
+
+
+@dataclass
+class Curve:
+    """Stations along a line, about one spacing apart; arrays of equal length.
+
+    Attributes:
+        points: ``(n, 2) float64``, metres, global frame.
+        sums: ``(n, 5) float64``, sums over the observations: information (inverse variance across the line, 1 / m²),
+            sightings weighted by score, view weights of those sightings, 1, and information times squared distance
+            from the fused station.
+        marks: ``(n, 2) uint64``, bits for the places from which the station was seen and for the tracks
+            (:mod:`mapfusion.integrate.uncertainty`).
+    """
+
+    points: Float
+    sums: Float
+    marks: Marks
+
+    @classmethod
+    def of(cls, points: Float, information: Float, seen: Float, seen_view: Float) -> Curve:
+        """Return a curve of one observation whose place and track are not known."""
+        count = len(points)
+        sums = np.stack([information, seen, seen_view, np.ones(count), np.zeros(count)], axis=1)
+        return cls(points, sums, np.ones((count, 2), dtype=np.uint64))
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def information(self) -> Float:
+        """``(n,) float64``, inverse variance across the line if errors were independent, 1 / m²."""
+        return self.sums[:, INFORMATION]
+
+    @property
+    def seen(self) -> Float:
+        """``(n,) float64``, sum of sightings, weighted by score."""
+        return self.sums[:, SEEN]
+
+    @property
+    def seen_view(self) -> Float:
+        """``(n,) float64``, sum of the view weights of those sightings."""
+        return self.sums[:, SEEN_VIEW]
+
+    def part(self, start: int, stop: int) -> Curve:
+        """Return stations ``start`` to ``stop`` (excluded)."""
+        return Curve(self.points[start:stop], self.sums[start:stop], self.marks[start:stop])
+
+    def reversed(self) -> Curve:
+        """Return the curve with its stations in the opposite order."""
+        return Curve(self.points[::-1], self.sums[::-1], self.marks[::-1])
+
+    def copy(self) -> Curve:
+        """Return a curve with arrays of its own."""
+        return Curve(self.points.copy(), self.sums.copy(), self.marks.copy())
+
+    @staticmethod
+    def join(parts: Sequence[Curve]) -> Curve:
+        """Put curves end to end."""
+        return Curve(
+            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.sums for part in parts]),
+            np.concatenate([part.marks for part in parts]),
+        )

@@ -1,0 +1,182 @@
+"""A line of the map: a curve whose stations carry position, variance and evidence, updated one curve at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import ElementKind
+from mapfusion.integrate.curve import INFORMATION, SCATTER, Curve
+from mapfusion.integrate.matching import Correspondence, correspond, tangents
+from mapfusion.integrate.observations import Track
+
+Float = NDArray[np.float64]
+
+BLEND_LENGTH = 10.0
+"""Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
+
+ONES = np.ones(2)
+
+
+@dataclass
+class Evidence:
+    """What is known of an element as a whole."""
+
+    first_seen: int
+    last_seen: int
+    observations: int = 1
+    tracks: dict[Track, int] = field(default_factory=dict)
+    """Track to the number of frames in which it was fused into this element."""
+    beside: dict[int, int] = field(default_factory=dict)
+    """Element id to the number of frames that showed it beside this one."""
+
+    def sighted(self, track: Track, timestamp: int, again: bool = False) -> None:
+        """Count one frame of a track; ``again`` where another observation of the same frame was counted."""
+        self.first_seen = min(self.first_seen, timestamp)
+        self.last_seen = max(self.last_seen, timestamp)
+        self.observations += not again
+        self.tracks[track] = self.tracks.get(track, 0) + 1
+
+    def absorb(self, other: Evidence) -> None:
+        """Add what is known of an element that turned out to be this one."""
+        self.first_seen = min(self.first_seen, other.first_seen)
+        self.last_seen = max(self.last_seen, other.last_seen)
+        self.observations += other.observations
+        for track, count in other.tracks.items():
+            self.tracks[track] = self.tracks.get(track, 0) + count
+        for element, count in other.beside.items():
+            self.beside[element] = self.beside.get(element, 0) + count
+
+
+@dataclass
+class FusedLine:
+    """A divider or boundary of the map.
+
+    Attributes:
+        kind: what it is.
+        curve: its stations.
+        evidence: what is known of it as a whole.
+        first: number of the first station; numbers stay with the stations when the line grows at its start.
+    """
+
+    kind: ElementKind
+    curve: Curve
+    evidence: Evidence
+    first: int = 0
+
+
+def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
+    """Fuse a curve into a line that it lies beside, in place.
+
+    Where both lie side by side, each station moves across the line to the mean weighted by information. Where the
+    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch.
+
+    Args:
+        line: of the map.
+        new: an observation, or the curve of another line of the map.
+        match: stations of the line (at least one) beside vertices of ``new``.
+
+    Returns:
+        The parts of ``new`` that leave the line sideways and must be something else.
+    """
+    base, last = line.curve, len(new) - 1
+    station, vertex, offset = match.station, match.vertex, match.offset
+    if 2 * np.count_nonzero(match.same_way) < len(station):
+        new = new.reversed()
+        vertex = last - vertex
+    head, tail = int(vertex.argmin()), int(vertex.argmax())
+    first_foot, last_foot = base.points[station[head]] + offset[head], base.points[station[tail]] + offset[tail]
+    gain = _average(base, new, match, vertex)
+
+    leftovers: list[Curve] = []
+    parts = [base]
+    if vertex[head] > 0:
+        before = new.part(0, int(vertex[head]))
+        if station[head] <= 1:
+            shift = -(1.0 - gain[head]) * offset[head]
+            parts.insert(0, _extension(before.reversed(), first_foot, shift, base.points).reversed())
+            line.first -= len(parts[0])
+        else:
+            leftovers.append(before)
+    if vertex[tail] < last:
+        after = new.part(int(vertex[tail]) + 1, last + 1)
+        if station[tail] >= len(base) - 2:
+            shift = -(1.0 - gain[tail]) * offset[tail]
+            parts.append(_extension(after, last_foot, shift, base.points))
+        else:
+            leftovers.append(after)
+    if any(len(part) for part in parts if part is not base):
+        line.curve = Curve.join(parts)
+    return leftovers
+
+
+def _average(base: Curve, new: Curve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
+    """Move stations to the weighted mean, in place; returns the new curve's share in it, ``(n,)``."""
+    station = match.station
+    added = new.sums.take(vertex, axis=0)
+    known = base.sums[:, INFORMATION].take(station)
+    gain = added[:, INFORMATION] / (known + added[:, INFORMATION])
+    # scatter about the common mean of two groups (Chan, Golub and LeVeque, 1979)
+    added[:, SCATTER] += gain * known * match.distance**2
+    # most often stations without a gap: a slice is several times as fast as their numbers
+    first, last = int(station[0]), int(station[-1])
+    rows = slice(first, last + 1) if last - first == len(station) - 1 else station
+    base.points[rows] += gain[:, None] * match.offset
+    base.sums[rows] += added
+    base.marks[rows] |= new.marks.take(vertex, axis=0)
+    return np.asarray(gain)
+
+
+def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
+    """Lead a piece over from the base's end and stop where it comes back to the base (a closed loop).
+
+    Args:
+        piece: vertices past the end, nearest first.
+        foot: ``(2,)``, where the base's end falls on the unshifted curve.
+        shift: ``(2,)``, from there to the fused end.
+        base: ``(n, 2)`` stations of the base.
+    """
+    at_start = squared(base[0] - foot) < squared(base[-1] - foot)
+    end = base[0] if at_start else base[-1]
+    inner = base[min(2, len(base) - 1)] if at_start else base[max(len(base) - 3, 0)]
+    outward = (end - inner) / max(math.sqrt(squared(end - inner)), 1e-9)
+    # vertices beside the base's end rather than past it would fold the line back
+    ahead = (piece.points[:3] + (shift - end)) @ outward >= 0.3
+    start = int(ahead.argmax()) if ahead.any() else len(ahead)
+    gap = piece.points - foot
+    away = np.sqrt((gap * gap) @ ONES)
+    points = piece.points + np.exp(away / -BLEND_LENGTH)[:, None] * shift
+    stop = len(piece)
+    if len(base) > 24 and stop > start:
+        other_end = base[-12:] if at_start else base[:12]
+        # a loop only if the piece comes anywhere near the other end
+        if (points.min(axis=0) < other_end.max(axis=0) + 0.6).all() and (
+            points.max(axis=0) > other_end.min(axis=0) - 0.6
+        ).all():
+            near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
+            if near.any():
+                stop = max(int(near.argmax()), start)
+    return Curve(points[start:stop], piece.sums[start:stop], piece.marks[start:stop])
+
+
+def squared(vector: Float) -> float:
+    """Return the squared length of a vector ``(2,)``."""
+    return float(vector[0] * vector[0] + vector[1] * vector[1])
+
+
+def beside(base: Curve, new: Curve, reach: float, angle: float) -> Correspondence:
+    """Return the stations of ``base`` beside ``new``."""
+    origin = new.points[0]
+    return correspond(
+        base.points - origin,
+        tangents(base.points),
+        np.zeros(len(base), dtype=np.int64),
+        new.points - origin,
+        tangents(new.points),
+        reach,
+        angle,
+        end=0.6,
+    )

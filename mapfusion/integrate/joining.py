@@ -1,0 +1,235 @@
+"""Pieces of one line put together: ends that run into each other, unless what lies between was looked at and bare.
+
+A detector that always ends a line at the same place, or two tracks of one line that never were one, leave two lines in
+the map where the road has one. They are joined here, when the map is made, so that the evidence stays as it was seen
+and the order of frames does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapfusion.elements import MapElement, united
+from mapfusion.geometry import arc_length
+from mapfusion.integrate.config import IntegratorConfig
+from mapfusion.integrate.views import ViewGrid
+from mapfusion.tidying import tidy
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+End = tuple[int, int]
+"""Which element, and 0 for its start or -1 for its end."""
+
+DIRECTION_LENGTH = 4.0
+"""The direction of an end is that of the last so many metres."""
+
+SHORTEST_LOOP = 8.0
+"""A shorter line is not led back to its own start, metres."""
+
+
+SAME_PLACE = 0.3
+"""Ends this close are one vertex of the joined line, metres."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """Two ends that may be one line.
+
+    Attributes:
+        cost: metres apart, and more where they do not point at each other; the least comes first.
+        ends: of the two elements.
+        overlap: how far the second one reaches back beside the first, metres.
+    """
+
+    cost: float
+    ends: tuple[End, End]
+    overlap: float
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The ends of elements, as arrays of equal length; crossings and closed lines have none.
+
+    Attributes:
+        element: ``(n,) int64``, which element.
+        end: ``(n,) int64``, 0 for its start, -1 for its end.
+        kind: ``(n,) int64``.
+        tip: ``(n, 2) float64``, metres.
+        outward: ``(n, 2) float64``, unit, the direction that leads out of it.
+    """
+
+    element: Integer
+    end: Integer
+    kind: Integer
+    tip: Float
+    outward: Float
+
+
+def ends_of(elements: Sequence[MapElement]) -> Ends:
+    """Return the ends of elements."""
+    rows = [
+        (number, end)
+        for number, element in enumerate(elements)
+        if not element.kind.is_ring and (element.points[0] != element.points[-1]).any()
+        for end in (0, -1)
+    ]
+    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    return Ends(
+        table[:, 0],
+        table[:, 1],
+        np.array([elements[number].kind for number, _ in rows], dtype=np.int64),
+        np.array([elements[number].points[end] for number, end in rows]).reshape(-1, 2),
+        np.array([_direction(elements[number].points, end) for number, end in rows]).reshape(-1, 2),
+    )
+
+
+def all_ends(pieces: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
+    """Put the ends of several lists of elements together, numbered as if the lists were one."""
+    known = [ends for _, ends in pieces]
+    before = np.cumsum([0, *(len(elements) for elements, _ in pieces)])
+    counts = [len(ends.element) for ends in known]
+    nothing = ends_of([])
+    columns = (
+        np.concatenate([getattr(nothing, name), *(getattr(ends, name) for ends in known)])
+        for name in ("element", "end", "kind", "tip", "outward")
+    )
+    element, end, kind, tip, outward = columns
+    return Ends(element + np.repeat(before[:-1], counts), end, kind, tip, outward)
+
+
+def join(elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
+    """Join the lines that go on in each other; crossings and closed lines stay as they are.
+
+    Args:
+        elements: of one map, metres.
+        views: where the car has looked.
+        config: how far apart, and how well in line, ends must be.
+
+    Returns:
+        The elements, in the order of the first piece of each.
+    """
+    return [element for _, element in chained(elements, links_between(elements, ends_of(elements), views, config))]
+
+
+def _direction(points: Float, end: int) -> Float:
+    """Return the unit direction that leads out of an end."""
+    line = points if end == -1 else points[::-1]
+    distance = arc_length(line)
+    back = max(distance[-1] - DIRECTION_LENGTH, 0.0)
+    inner = np.array([np.interp(back, distance, line[:, axis]) for axis in range(2)])
+    step = line[-1] - inner
+    return np.asarray(step / max(float(np.linalg.norm(step)), 1e-9))
+
+
+def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, config: IntegratorConfig) -> list[Link]:
+    """Return the pairs of ends that go on in each other, the best first."""
+    if len(ends.tip) < 2:
+        return []
+    first, second = cKDTree(ends.tip).query_pairs(config.join_gap, output_type="ndarray").T
+    against = -(ends.outward[first] * ends.outward[second]).sum(axis=1)
+    keep = (ends.kind[first] == ends.kind[second]) & (against > np.cos(np.radians(config.join_angle)))
+    first, second = first[keep], second[keep]
+    axis = ends.outward[first] - ends.outward[second]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    gap = ends.tip[second] - ends.tip[first]
+    along = (gap * axis).sum(axis=1)
+    aside = np.linalg.norm(gap - along[:, None] * axis, axis=1)
+    reach = config.join_aside * (1.0 + np.maximum(along, 0.0) / config.join_gap)
+    keep = (along >= -config.join_overlap) & (aside <= reach)
+    links = []
+    for row in np.flatnonzero(keep).tolist():
+        one, two = ((int(ends.element[k]), int(ends.end[k])) for k in (first[row], second[row]))
+        ahead = float(along[row])
+        if one[0] == two[0] and (ahead < 0.0 or elements[one[0]].length < SHORTEST_LOOP):
+            continue
+        if ahead > config.max_gap:
+            share = np.linspace(0.0, 1.0, int(ahead) + 2)[1:-1, None]
+            if float(np.median(views.at(ends.tip[first[row]] + share * gap[row]))) > config.join_views:
+                continue
+        links.append(Link(abs(ahead) + 2.0 * float(aside[row]), (one, two), max(-ahead, 0.0)))
+    return sorted(links, key=lambda link: (link.cost, link.ends))
+
+
+def chained(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
+    """Join along links, each end once, in their order.
+
+    Returns:
+        The number of the first piece of each element, ascending, and the element.
+    """
+    parts: dict[int, MapElement] = dict(enumerate(elements))
+    used: set[End] = set()
+    # where the outer ends of joined pieces are now, and the way back
+    at: dict[End, End] = {}
+    was: dict[End, End] = {}
+    for link in links:
+        if not used.isdisjoint(link.ends):
+            continue
+        used.update(link.ends)
+        (one, end), (two, start) = (at.get(outer, outer) for outer in link.ends)
+        if one == two:
+            parts[one] = _closed(parts[one])
+            continue
+        before = parts[one] if end == -1 else _reversed(parts[one])
+        after = parts[two] if start == 0 else _reversed(parts[two])
+        keep, drop = min(one, two), max(one, two)
+        del parts[drop]
+        parts[keep] = _joined(before, after, link.overlap)
+        outer_ends = [was.get(other, other) for other in ((one, -1 - end), (two, -1 - start))]
+        for outer, now in zip(outer_ends, ((keep, 0), (keep, -1)), strict=True):
+            at[outer], was[now] = now, outer
+    return sorted(parts.items())
+
+
+def _reversed(element: MapElement) -> MapElement:
+    deviation = element.deviation
+    return replace(element, points=element.points[::-1], deviation=None if deviation is None else deviation[::-1])
+
+
+def _closed(element: MapElement) -> MapElement:
+    deviation = element.deviation
+    return replace(
+        element,
+        points=np.vstack([element.points, element.points[:1]]),
+        deviation=None if deviation is None else np.append(deviation, deviation[0]),
+    )
+
+
+def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement:
+    """Put two elements end to end; where they overlap, each gives up half."""
+    one, one_deviation = _cut_back(_reversed(before), overlap / 2)
+    two, two_deviation = _cut_back(after, overlap / 2)
+    share = before.length / max(before.length + after.length, 1e-9)
+    skip = int(len(two) > 1 and np.linalg.norm(two[0] - one[0]) < SAME_PLACE)
+    points = np.concatenate([one[::-1], two[skip:]])
+    rows = tidy(points)
+    deviation: Float | None = None
+    if one_deviation is not None and two_deviation is not None:
+        deviation = np.concatenate([one_deviation[::-1], two_deviation[skip:]])[rows]
+    return replace(
+        before,
+        points=points[rows],
+        deviation=deviation,
+        confidence=share * before.confidence + (1.0 - share) * after.confidence,
+        # frames that saw both are counted in either, so that the sum would count them twice
+        observations=max(before.observations, after.observations),
+        first_seen=min(before.first_seen, after.first_seen),
+        last_seen=max(before.last_seen, after.last_seen),
+    ).with_origins(united([before.origins, after.origins]))
+
+
+def _cut_back(element: MapElement, length: float) -> tuple[Float, Float | None]:
+    """Return points and deviations without the first so many metres, but at least the last segment."""
+    points, deviation = element.points, element.deviation
+    distance = arc_length(points)
+    length = min(length, 0.9 * float(distance[-1]))
+    if length <= 0.0:
+        return points, deviation
+    rest = distance > length
+    start = [np.interp(length, distance, points[:, axis]) for axis in range(2)]
+    cut = np.vstack([start, points[rest]])
+    return cut, None if deviation is None else np.append(np.interp(length, distance, deviation), deviation[rest])

@@ -1,0 +1,151 @@
+"""The integrator's state on disk: arrays and JSON in one ``.npz`` file, no pickle."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.elements import ElementKind
+from mapfusion.formats.geojson import write_whole
+from mapfusion.integrate.config import IntegratorConfig
+from mapfusion.integrate.curve import Curve
+from mapfusion.integrate.frame_log import LogBook
+from mapfusion.integrate.fused_line import Evidence, FusedLine
+from mapfusion.integrate.fused_ring import FusedRing
+from mapfusion.integrate.uncertainty import ErrorModel
+
+if TYPE_CHECKING:
+    from mapfusion.integrate.integrator import MapIntegrator
+
+FORMAT = 3
+"""Version of the file's layout; files of another version are refused."""
+
+Item = TypeVar("Item")
+
+
+def save_state(integrator: MapIntegrator, path: Path) -> None:
+    """Write everything an integrator knows; the file appears complete or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    lines, rings, tiles = integrator.lines, integrator.rings, integrator.views.tiles
+    curves = [line.curve for line in lines.values()]
+    header = {
+        "format": FORMAT,
+        "config": asdict(integrator.config),
+        "rejections": dict(integrator.rejections),
+        "frames": integrator.frames,
+        "next_id": integrator.next_id,
+        "logs": {log: [book.times, book.positions, book.believed] for log, book in integrator.journal.logs.items()},
+        "lines": [
+            {
+                "id": i,
+                "kind": int(line.kind),
+                "count": len(line.curve),
+                "first": line.first,
+                "evidence": _plain(line.evidence),
+            }
+            for i, line in lines.items()
+        ],
+        "rings": [
+            {
+                "id": i,
+                "corner": ring.corner.tolist(),
+                "shape": ring.looked.shape,
+                "seen": ring.seen,
+                "scatter": ring.scatter,
+                "evidence": _plain(ring.evidence),
+            }
+            for i, ring in rings.items()
+        ],
+        "tiles": list(tiles),
+    }
+    arrays = {
+        "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8),
+        "points": _flat(curves, lambda curve: curve.points.ravel(), np.float64),
+        "sums": _flat(curves, lambda curve: curve.sums.ravel(), np.float64),
+        "marks": _flat(curves, lambda curve: curve.marks.ravel(), np.uint64),
+        "ring_marks": _flat(rings.values(), lambda ring: ring.marks, np.uint64),
+        "errors": integrator.errors.state(),
+        "ring_distance": _flat(rings.values(), lambda ring: ring.distance.ravel(), np.float32),
+        "ring_looked": _flat(rings.values(), lambda ring: ring.looked.ravel(), np.float32),
+        "ring_seen_view": _flat(rings.values(), lambda ring: ring.seen_view.ravel(), np.float32),
+        "views": _flat(tiles.values(), lambda tile: tile.ravel(), np.float32),
+    }
+    with write_whole(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_state(integrator: MapIntegrator, path: Path) -> None:
+    """Fill an empty integrator with what a file of :func:`save_state` holds.
+
+    Raises:
+        ValueError: not such a file.
+        OSError: the file cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(arrays["header"].tobytes())
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{path}: not the saved state of a map integrator: {error}") from error
+    if header.get("format") != FORMAT:
+        raise ValueError(f"{path}: layout {header.get('format')} of another version; this one reads {FORMAT}")
+    _restore(integrator, header, arrays)
+
+
+def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    integrator.config = IntegratorConfig(**header["config"])
+    integrator.views.config = integrator.config
+    integrator.rejections = Counter(header["rejections"])
+    integrator.frames, integrator.next_id = header["frames"], header["next_id"]
+    integrator.journal.logs = {
+        log: LogBook(number, times, [(x, y) for x, y in positions], believed)
+        for number, (log, (times, positions, believed)) in enumerate(header["logs"].items())
+    }
+    integrator.errors = ErrorModel.from_state(arrays["errors"])
+    curves = Curve(arrays["points"].reshape(-1, 2), arrays["sums"].reshape(-1, 5), arrays["marks"].reshape(-1, 2))
+    at = 0
+    for entry in header["lines"]:
+        curve = curves.part(at, at + entry["count"]).copy()
+        line = FusedLine(ElementKind(entry["kind"]), curve, _evidence(entry["evidence"]), entry["first"])
+        integrator.put_line(entry["id"], line)
+        at += len(curve)
+    at = 0
+    for entry, marks in zip(header["rings"], arrays["ring_marks"].reshape(-1, 2), strict=True):
+        shape = tuple(entry["shape"])
+        part = slice(at, at + shape[0] * shape[1])
+        distance, looked, seen_view = (
+            arrays[name][part].reshape(shape) for name in ("ring_distance", "ring_looked", "ring_seen_view")
+        )
+        corner = np.array(entry["corner"], dtype=np.int64)
+        evidence = _evidence(entry["evidence"])
+        ring = FusedRing(corner, distance, looked, seen_view, entry["seen"], evidence, entry["scatter"], marks.copy())
+        integrator.put_ring(entry["id"], ring)
+        at = part.stop
+    tiles = [(int(row), int(column)) for row, column in header["tiles"]]
+    side = integrator.views.side
+    integrator.views.tiles = dict(zip(tiles, arrays["views"].reshape(len(tiles), side, side).copy(), strict=True))
+
+
+def _flat(items: Iterable[Item], part: Callable[[Item], NDArray[Any]], dtype: type) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0, dtype), *(part(item) for item in items)])
+
+
+def _plain(evidence: Evidence) -> list[Any]:
+    tracks = [[*track, count] for track, count in evidence.tracks.items()]
+    return [evidence.first_seen, evidence.last_seen, evidence.observations, tracks, list(evidence.beside.items())]
+
+
+def _evidence(plain: list[Any]) -> Evidence:
+    first, last, observations, tracks, beside = plain
+    return Evidence(first, last, observations, {(log, track): count for log, track, count in tracks}, dict(beside))

@@ -1,0 +1,296 @@
+"""How far a fused element may be from the truth: what of the detector's errors averages out, and what does not.
+
+The error of a detection across the line is the sum of parts that differ in how long they last: one that is new in
+every frame, some that stay while the car moves on by a certain distance, one that stays as long as the track does, and
+one that no observation shows (:attr:`mapfusion.IntegratorConfig.common_deviation`). Only what is new averages out. How
+much each of the others has is learnt from the differences between two detections of the same station, by the distance
+that the car went between them and by whether the track was the same (a variogram), for the whole map; how noisy a
+stretch of one element is, from the scatter of its own observations. Both start from a prior that stands for few
+observations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
+from scipy.special import expit
+
+from mapfusion.integrate.curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, Curve
+
+if TYPE_CHECKING:
+    from mapfusion.integrate.fused_ring import FusedRing
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+Marks = NDArray[np.uint64]
+Record = tuple[int, Integer, Float, Float, Float, tuple[float, ...]]
+
+PLACE = 5.0
+"""Side of the cells in which it is noted from where the car saw a station, metres."""
+
+LASTING = np.array([10.0, 30.0])
+"""Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
+
+PRIOR_SHARES = np.array([0.5, 0.15, 0.2, 0.15])
+"""Share in the variance of a detection before anything was learnt: new in every frame, :data:`LASTING`, track."""
+
+PRIOR_SPREAD = 0.6
+"""Standard deviation of the prior of each share."""
+
+NOTHING_LASTS = 0.1
+"""Probability, before anything was learnt, that all of the error is new in every frame."""
+
+PRIOR_OBSERVATIONS = 6.0
+"""Observations that the prior of the noise of one element stands for."""
+
+WINDOW = 20
+"""Stations over which the scatter of an element is averaged; as far as the errors of one detection hang together."""
+
+RING_ROUNDING = 0.095
+"""Corners of crossings are rounded by the cells and the cut-off of their signed distances, metres."""
+
+PROBE_SPACING = 8
+"""Every so many stations differences are taken."""
+
+CAPACITY = 4096
+"""Records are compared and forgotten when there are so many."""
+
+COMPANIONS = (1, 2, 3, 5, 8, 13)
+"""Each record is compared with those of its station that came so many records later."""
+
+OUTLIER = 9.0 / 0.455
+"""Squared differences count as at most so many medians: three deviations of a normal distribution."""
+
+SCRAMBLE = np.array([1.0, 1e5 + 0.7])
+"""Makes one number of two, different ones for different pairs."""
+
+LEAST_VARIANCE = 1e-3
+"""No detector is better than this, as a multiple of the variance that it is assumed to have."""
+
+LAGS = np.array([0.0, 2.5, 7.5, 15.0, 30.0, 60.0, np.inf])
+"""Classes of the distance that the car went between two observations, metres."""
+
+
+def place_mark(log: int, position: Float) -> int:
+    """Return the bit that stands for where the car was: one of 64, neighbours differ."""
+    x, y = int(np.floor(position[0] / PLACE)), int(np.floor(position[1] / PLACE))
+    return 1 << ((x + 27 * y + 11 * log) % 64)
+
+
+def track_mark(log: int, track: int) -> int:
+    """Return the bit that stands for a track: one of 64."""
+    return 1 << ((track + 37 * log) % 64)
+
+
+def distinct(marks: Marks) -> Float:
+    """Estimate how many different things have left a mark (linear counting: Whang et al., TODS 1990), at least 1."""
+    free = np.maximum(64.0 - np.bitwise_count(marks), 0.5)
+    return np.asarray(np.maximum(-64.0 * np.log(free / 64.0), 1.0))
+
+
+@dataclass
+class ErrorModel:
+    """Variance of the parts of a detection's error, as multiples of the variance that the detector is assumed to have.
+
+    Attributes:
+        squares: ``(2, classes) float64``, sum of the squared differences by same or other track and by lag.
+        lags: the same shape, sum of the lags, metres.
+        pairs: the same shape, number of differences.
+        contrasts: the same shape, about how many of the differences are independent.
+    """
+
+    squares: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
+    lags: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
+    pairs: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
+    contrasts: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
+    _records: list[Record] = field(default_factory=list)
+    _count: int = 0
+
+    def note(
+        self,
+        element: int,
+        numbers: Integer,
+        feet: Float,
+        directions: Float,
+        weight: Float,
+        seen_from: tuple[float, ...],
+    ) -> None:
+        """Keep where one detection lay, to compare it with others of the same stations.
+
+        Args:
+            element: id of the element.
+            numbers: ``(n,)``, which stations.
+            feet: ``(n, 2)``, metres, where the detection passed each station.
+            directions: ``(n, 2)``, unit, along the detection there.
+            weight: ``(n,)``, information of the detection, 1 / m².
+            seen_from: where the car was, two coordinates in metres, and the track's number.
+        """
+        self._records.append((element, numbers, feet, directions, weight, seen_from))
+        self._count += len(numbers)
+        if self._count >= CAPACITY:
+            self.learn()
+
+    def learn(self) -> None:
+        """Take the differences between the records kept so far, and forget them."""
+        if not self._records:
+            return
+        elements, numbers, feet, directions, weight, seen_from = zip(*self._records, strict=True)
+        sizes = [len(part) for part in numbers]
+        number = np.concatenate(numbers)
+        order = np.lexsort((number, np.repeat(elements, sizes)))
+        records = np.column_stack(
+            [
+                np.repeat(elements, sizes),
+                number,
+                np.concatenate(feet),
+                np.concatenate(directions),
+                np.concatenate(weight),
+                np.repeat(np.array(seen_from), sizes, axis=0),
+            ]
+        )[order]
+        self._records, self._count = [], 0
+        seen: list[Float] = []
+        for step in COMPANIONS:
+            one, two = records[:-step], records[step:]
+            same = np.flatnonzero((one[:, 0] == two[:, 0]) & (one[:, 1] == two[:, 1]))
+            if not len(same):
+                break
+            one, two = one[same], two[same]
+            gap = one[:, 2:4] - two[:, 2:4]
+            across = gap[:, 0] * one[:, 5] - gap[:, 1] * one[:, 4]
+            square = across**2 / (1.0 / one[:, 6] + 1.0 / two[:, 6])
+            lag = np.hypot(one[:, 7] - two[:, 7], one[:, 8] - two[:, 8])
+            # differences of one track from places less than a lag apart hang together, as do all of two tracks
+            other = one[:, 9] != two[:, 9]
+            block = np.floor(one[:, 7:9] / np.maximum(lag, PLACE)[:, None]) @ SCRAMBLE
+            tracks = one[:, 9] + two[:, 9]
+            seen.append(np.column_stack([other, lag, square, one[:, 0] * SCRAMBLE[1] + np.where(other, tracks, block)]))
+        if seen:
+            self._count_in(np.concatenate(seen))
+
+    def _count_in(self, pairs: Float) -> None:
+        """Add pairs: other track or not, lag, squared difference, and a number for the contrast they belong to."""
+        other, lag, square, contrast = pairs.T
+        # two lines taken for one, or a ghost beside a line, say nothing of the detector's error
+        square = np.minimum(square, OUTLIER * np.median(square))
+        group = other.astype(np.int64) * (len(LAGS) - 1) + np.searchsorted(LAGS, lag, side="right") - 1
+        shape = self.pairs.shape
+        for total, values in ((self.squares, square), (self.lags, lag), (self.pairs, np.ones_like(lag))):
+            total += np.bincount(group, weights=values, minlength=total.size).reshape(shape)
+        different = np.unique(group + 1j * contrast).real.astype(np.int64)
+        self.contrasts += np.bincount(different, minlength=self.contrasts.size).reshape(shape)
+
+    def state(self) -> Float:
+        """Return what was learnt, as one array for :meth:`from_state`; the records kept are taken in first."""
+        self.learn()
+        return np.stack([self.squares, self.lags, self.pairs, self.contrasts])
+
+    @classmethod
+    def from_state(cls, state: Float) -> ErrorModel:
+        """Return the model of :meth:`state`."""
+        squares, lags, pairs, contrasts = state.reshape(4, 2, -1).copy()
+        return cls(squares, lags, pairs, contrasts)
+
+    def parts(self) -> Float:
+        """Return the variance of each part, ``(2 + len(LASTING),)``: new in every frame, lasting, track."""
+        self.learn()
+        row, column = np.nonzero(self.pairs)
+        if not len(row):
+            return PRIOR_SHARES
+        pairs, contrasts = self.pairs[row, column], self.contrasts[row, column]
+        level, lag = self.squares[row, column] / pairs, self.lags[row, column] / pairs
+        basis = np.column_stack([np.ones(len(row)), 1.0 - np.exp(-lag[:, None] / LASTING), row])
+        expected = basis @ PRIOR_SHARES
+        total = max(float((contrasts * level).sum() / (contrasts * expected).sum()), LEAST_VARIANCE)
+        # a squared normal variable has a variance of twice its squared mean
+        noise = total * expected * np.sqrt(2.0 / contrasts)
+        prior = 1.0 / (total * PRIOR_SPREAD)
+        solved, _ = nnls(
+            np.concatenate([basis / noise[:, None], np.eye(len(PRIOR_SHARES)) * prior]),
+            np.concatenate([level / noise, PRIOR_SHARES * total * prior]),
+        )
+        # the mean of both answers, by how well either foretells the differences (Bayesian model averaging)
+        only_new = np.zeros(len(PRIOR_SHARES))
+        only_new[0] = max(float((contrasts * level).sum() / contrasts.sum()), LEAST_VARIANCE)
+        odds = np.log(NOTHING_LASTS / (1.0 - NOTHING_LASTS))
+        odds += _log_evidence(level - only_new[0], noise, basis[:, :1] / prior)
+        odds -= _log_evidence(level - total * expected, noise, basis / prior)
+        share = expit(odds)
+        return np.asarray(share * only_new + (1.0 - share) * solved)
+
+
+def _log_evidence(residual: Float, noise: Float, basis: Float) -> float:
+    """Return the log-likelihood of residuals under noise and unknown multiples of basis functions, up to a constant.
+
+    Args:
+        residual: ``(n,)``.
+        noise: ``(n,)``, deviations.
+        basis: ``(n, k)``, times the deviation of its coefficient.
+    """
+    factor = np.linalg.cholesky(np.diag(noise**2) + basis @ basis.T)
+    standard = solve_triangular(factor, residual, lower=True)
+    return float(-0.5 * (standard @ standard) - np.log(np.diag(factor)).sum())
+
+
+def line_deviations(curve: Curve, parts: Float, common: float) -> Float:
+    """Return the standard deviation of fused stations across the line, metres, ``(n,)``.
+
+    Args:
+        curve: the stations.
+        parts: of :meth:`ErrorModel.parts`.
+        common: deviation that all detections of an element share, metres.
+    """
+    sums, marks = curve.sums, curve.marks
+    mean, count = _mean_variance(parts, sums[:, OBSERVATIONS], marks[:, PLACES], marks[:, TRACKS])
+    expected = _average(count * (1.0 - mean / parts.sum()).clip(0.0))
+    noise = _noise(_average(sums[:, SCATTER]) / parts.sum(), expected)
+    return np.asarray(np.sqrt(noise * mean * count / np.maximum(sums[:, INFORMATION], 1e-6) + common**2))
+
+
+def ring_deviations(ring: FusedRing, information: Float, parts: Float, common: float) -> Float:
+    """Return the standard deviation of a crossing's outline, metres.
+
+    Args:
+        ring: the crossing.
+        information: ``(n,)``, at points of its outline, 1 / m².
+        parts: of :meth:`ErrorModel.parts`.
+        common: deviation that all detections of an element share, metres.
+
+    Returns:
+        ``(n,) float64``.
+    """
+    information = np.maximum(information, 1e-2)
+    seen = float(ring.evidence.observations)
+    mean, count = _mean_variance(parts, seen * information / information.max(), *ring.marks)
+    noise = _noise(ring.scatter / parts.sum(), seen * np.maximum(1.0 - mean.min() / parts.sum(), 0.0))
+    return np.asarray(np.sqrt(noise * mean * count / information + common**2 + RING_ROUNDING**2))
+
+
+def _mean_variance(parts: Float, observations: Float, places: Marks, tracks: Marks) -> tuple[Float, Float]:
+    """Return the variance of the mean of the observations of a station, and their number, at least 1.
+
+    The variance is a multiple of that which one observation is assumed to have.
+    """
+    count = np.maximum(observations, 1.0)
+    lasting = LASTING / (PLACE * distinct(places))[..., None]
+    # variance of the mean of a process whose correlation falls off exponentially
+    remains = 2.0 * lasting * (1.0 + lasting * np.expm1(-1.0 / lasting))
+    return parts[0] / count + remains @ parts[1:-1] + parts[-1] / np.minimum(distinct(tracks), count), count
+
+
+def _noise(found: Float | float, expected: Float | float) -> Float | float:
+    """Return by how much an element's observations scatter more than the map's do, as a ratio of variances."""
+    return (PRIOR_OBSERVATIONS + found) / (PRIOR_OBSERVATIONS + expected)
+
+
+def _average(values: Float) -> Float:
+    """Return running means over :data:`WINDOW` entries, fewer at the ends."""
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    at = np.arange(len(values))
+    first, stop = np.maximum(at - WINDOW // 2, 0), np.minimum(at + WINDOW // 2 + 1, len(values))
+    return np.asarray((total[stop] - total[first]) / (stop - first))

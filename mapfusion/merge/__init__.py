@@ -1,0 +1,1 @@
+"""Maps of many drives into one map."""

@@ -1,0 +1,385 @@
+"""Maps of many drives made into one: poses corrected between drives, evidence added up, tile by tile."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from mapfusion.alignment import Alignment, Landmarks, align, landmarks
+from mapfusion.elements import ElementKind, GlobalMap, MapElement
+from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
+from mapfusion.formats.geojson import InvertibleGeoreference
+from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.ground import coverage, ground_within, rings_around
+from mapfusion.merge.corrections import Correction, solve_corrections
+from mapfusion.merge.lines import Contribution, Looks, MergeConfig, fuse_lines
+from mapfusion.merge.report import MapStatus, MergeReport, short_names
+from mapfusion.merge.rings import fuse_rings
+from mapfusion.merge.tiles import Piece, Stitcher, Tile, cut_line, tiles_of
+from mapfusion.tidying import tidy
+
+Float = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+"""Called as ``progress(done, in all, what)``."""
+
+CACHED_MAPS = 48
+"""Maps that are held in memory at a time; neighbouring tiles need the same ones."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """What is remembered of a map while it is not in memory."""
+
+    name: str
+    place: int
+    low: Float
+    high: Float
+    evidence: float
+    digest: str
+    observed: list[list[list[float]]] | None
+
+    @property
+    def centre(self) -> Float:
+        return (self.low + self.high) / 2
+
+
+class _Shelf:
+    """Maps that are read when they are needed; a few are kept."""
+
+    def __init__(self, maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None) -> None:
+        self.maps = maps
+        self.plane = plane
+        self.corrections: dict[int, Correction] = {}
+        self.raw = lru_cache(CACHED_MAPS)(self._raw)
+        self.landmarks = lru_cache(CACHED_MAPS)(self._landmarks)
+        self.corrected = lru_cache(CACHED_MAPS)(self._corrected)
+
+    def _raw(self, place: int) -> GlobalMap:
+        item = self.maps[place]
+        return read_map(item, self.plane) if isinstance(item, Path) else item
+
+    def _landmarks(self, place: int) -> Landmarks:
+        return landmarks(self._raw(place))
+
+    def _corrected(self, place: int) -> tuple[GlobalMap, shapely.Geometry]:
+        """A map and its ground where they belong."""
+        raw = self._raw(place)
+        ground = coverage(raw, self.plane)
+        correction = self.corrections.get(place)
+        if correction is None:
+            return raw, ground
+        moved = tuple(replace(element, points=correction.apply(element.points)) for element in raw)
+        return GlobalMap(moved, raw.provenance), shapely.transform(ground, correction.apply)
+
+
+_shelf: _Shelf
+"""Of a worker process."""
+
+
+def _start_worker(
+    maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None, corrections: dict[int, Correction]
+) -> None:
+    global _shelf
+    _shelf = _Shelf(maps, plane)
+    _shelf.corrections = corrections
+
+
+def _align_in_worker(task: tuple[int, list[int]]) -> list[tuple[int, int, Alignment]]:
+    return _align_with(_shelf, *task)
+
+
+def _fuse_in_worker(task: tuple[Tile, list[int], Sequence[str], MergeConfig]) -> tuple[list[Piece], list[MapElement]]:
+    return _fuse_tile(_shelf, *task)
+
+
+def merge_maps(
+    maps: Sequence[GlobalMap],
+    names: Sequence[str] | None = None,
+    config: MergeConfig | None = None,
+    plane: InvertibleGeoreference | None = None,
+) -> tuple[GlobalMap, MergeReport]:
+    """Merge maps of one place that are in memory and in one metric frame.
+
+    The result does not depend on the order of the maps.
+
+    Args:
+        maps: metres.
+        names: of the maps, all different; ``map 0``, ``map 1`` ... without.
+        config: what is assumed.
+        plane: leads from degrees to that frame, for maps that say what ground they observed.
+
+    Returns:
+        The merged map; each element's ``sources`` name the drives it comes from, or the maps if those do not name any.
+        And what became of the maps.
+    """
+    names = list(names) if names is not None else [f"map {i}" for i in range(len(maps))]
+    merge = _Merge(_Shelf(maps, plane), names, config or MergeConfig())
+    elements = tuple(merge.elements(1, None))
+    return GlobalMap(elements, {"sources": sorted(names)}), merge.report()
+
+
+def merge_files(
+    paths: Sequence[Path],
+    out: Path,
+    config: MergeConfig | None = None,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    provenance: dict[str, Any] | None = None,
+) -> MergeReport:
+    """Merge map files of one city into one file; what is held in memory depends on the tiles, not on the city.
+
+    Args:
+        paths: maps to merge.
+        out: file to write; a GeoJSON file is written as the tiles are done, other formats at the end.
+        config: what is assumed.
+        jobs: processes.
+        progress: called as the work goes on.
+        provenance: what else the file should tell of its origin.
+
+    Raises:
+        ValueError: a file that is not a map, maps that lie too far apart, or two maps of the same name.
+        OSError: a file cannot be read or written.
+    """
+    boxes = [box for box in (read_box(path) for path in paths) if box is not None]
+    plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
+    names = short_names(paths)
+    merge = _Merge(_Shelf(list(paths), plane), names, config or MergeConfig())
+    told = {"generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
+    observed = merge.observed()
+    if observed is not None:
+        told["observed"] = observed
+    with MapWriter(out, plane, told) as writer:
+        for element in merge.elements(jobs, progress):
+            writer.write(element)
+    return merge.report()
+
+
+class _Merge:
+    """One merge, from the maps to the elements of the result."""
+
+    def __init__(self, shelf: _Shelf, names: Sequence[str], config: MergeConfig) -> None:
+        self.shelf = shelf
+        self.config = config
+        entries = [entry for entry in (_entry(shelf, i, name) for i, name in enumerate(names)) if entry is not None]
+        entries.sort(key=lambda entry: (-entry.evidence, entry.digest, entry.name))
+        first: dict[str, _Entry] = {}
+        for entry in entries:
+            first.setdefault(entry.digest, entry)
+        self.entries = list(first.values())
+        self.duplicates = tuple(sorted(entry.name for entry in entries if first[entry.digest] is not entry))
+        self.empty = sorted(set(names) - {entry.name for entry in entries})
+        self.names = list(names)
+        self.statuses: list[MapStatus] = [MapStatus(name, 0.0, 0.0, 0, "the map is empty") for name in self.empty]
+        self.counts = {kind.label: 0 for kind in ElementKind}
+        self.metres = {kind.label: 0.0 for kind in ElementKind}
+        self.tile_count = 0
+
+    def observed(self) -> list[list[list[float]]] | None:
+        """Return the ground that the maps together have observed, rings in degrees, if each of them says its own."""
+        if not self.entries or not all(entry.observed for entry in self.entries):
+            return None
+        grounds = [ground_within([np.array(ring) for ring in entry.observed or ()]) for entry in self.entries]
+        return [np.round(ring, 7).tolist() for ring in rings_around(shapely.union_all(grounds))]
+
+    def elements(self, jobs: int, progress: Progress | None) -> Iterator[MapElement]:
+        """Correct the poses, then yield the elements of the result in the order of the tiles."""
+        say = progress or (lambda done, total, what: None)
+        apart = self._correct(jobs, say)
+        fused = [entry for entry in self.entries if entry.place not in apart]
+        for element in self._fused(fused, jobs, say):
+            yield self._counted(element)
+        for entry in self.entries:
+            if entry.place in apart:
+                for element in self.shelf.raw(entry.place):
+                    yield self._counted(_named(element, entry.name))
+
+    def report(self) -> MergeReport:
+        """What came of it, once all elements were taken."""
+        statuses = tuple(sorted(self.statuses, key=lambda status: status.name))
+        return MergeReport(statuses, self.duplicates, self.counts, self.metres, self.tile_count)
+
+    def _counted(self, element: MapElement) -> MapElement:
+        self.counts[element.kind.label] += 1
+        self.metres[element.kind.label] += element.length
+        return element
+
+    def _correct(self, jobs: int, say: Progress) -> set[int]:
+        """Align the maps with each other; returns those that contradict the others."""
+        tasks = _partners(self.entries, self.config.max_partners)
+        found: dict[tuple[int, int], Alignment] = {}
+        for done, row in enumerate(self._each(_align_with, _align_in_worker, tasks, jobs), start=1):
+            found.update({(first, second): alignment for first, second, alignment in row})
+            say(done, len(tasks), "aligning")
+        number = {entry.place: i for i, entry in enumerate(self.entries)}
+        certain = {(number[a], number[b]): alignment for (a, b), alignment in found.items() if alignment.certain}
+        centres = np.array([entry.centre for entry in self.entries]).reshape(-1, 2)
+        corrections = solve_corrections(centres, certain)
+        apart: set[int] = set()
+        for i, (entry, correction) in enumerate(zip(self.entries, corrections, strict=True)):
+            own = [alignment for pair, alignment in found.items() if entry.place in pair]
+            partners = sum(i in pair for pair in certain)
+            doubts = sorted(own, key=lambda alignment: (-alignment.overlap, alignment.refusal))
+            note, contradicts = "", False
+            if not own:
+                note = "no other map of this place"
+            elif not partners:
+                note, contradicts = doubts[0].refusal, doubts[0].disagrees
+            if contradicts:
+                apart.add(entry.place)
+            if partners:
+                self.shelf.corrections[entry.place] = correction
+            shift, turn = float(np.linalg.norm(correction.shift)), float(np.degrees(correction.turn))
+            self.statuses.append(MapStatus(entry.name, shift, turn, partners, note, contradicts))
+        return apart
+
+    def _fused(self, entries: list[_Entry], jobs: int, say: Progress) -> Iterator[MapElement]:
+        reach = self.config.margin + 6.0
+        members: dict[Tile, list[int]] = {}
+        for entry in entries:
+            for tile in tiles_of(entry.low - reach, entry.high + reach, self.config.tile):
+                members.setdefault(tile, []).append(entry.place)
+        tiles = sorted(members)
+        self.tile_count = len(tiles)
+        stitcher = Stitcher(tiles)
+        tasks = [(tile, members[tile], self.names, self.config) for tile in tiles]
+        results = self._each(_fuse_tile, _fuse_in_worker, tasks, jobs)
+        for done, (tile, (pieces, rings)) in enumerate(zip(tiles, results, strict=True), start=1):
+            for piece in stitcher.add(tile, pieces):
+                yield from self._finished(piece)
+            yield from rings
+            say(done, len(tiles), "merging tiles")
+        for piece in stitcher.rest():
+            yield from self._finished(piece)
+
+    def _finished(self, piece: Piece) -> Iterator[MapElement]:
+        rows = tidy(piece.points)
+        points, values = piece.points[rows], piece.values[rows]
+        line = shapely.LineString(points) if len(rows) > 1 else None
+        if line is None or line.length < self.config.min_length:
+            return
+        simple = shapely.get_coordinates(shapely.simplify(line, self.config.simplify_tolerance))
+        row_of = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
+        deviation = np.sqrt(values[[row_of[point] for point in map(tuple, simple.tolist())], 0])
+        element = MapElement(
+            kind=piece.kind,
+            points=simple,
+            confidence=float(expit(np.clip(values[:, 1], -6.0, 6.0)).mean()),
+            observations=sum(piece.observations.values()),
+            first_seen=piece.first_seen,
+            last_seen=piece.last_seen,
+            deviation=deviation,
+        )
+        yield element.with_origins(piece.origins)
+
+    def _each(self, direct: Any, in_worker: Any, tasks: Sequence[Any], jobs: int) -> Iterator[Any]:
+        """Do the tasks here or in processes, results in order."""
+        if jobs <= 1 or len(tasks) < 2:
+            yield from (direct(self.shelf, *task) for task in tasks)
+            return
+        shelf = (self.shelf.maps, self.shelf.plane, self.shelf.corrections)
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_start_worker, initargs=shelf) as pool:
+            yield from pool.map(in_worker, tasks, chunksize=4)
+
+
+def _entry(shelf: _Shelf, place: int, name: str) -> _Entry | None:
+    """Look at a map once, before anything is merged; None for an empty one."""
+    raw = shelf.raw(place)
+    if not len(raw):
+        return None
+    points = np.concatenate([element.points for element in raw])
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name}: a point is not finite")
+    digest = hashlib.sha256()
+    for row in sorted((int(e.kind), e.confidence, e.observations, np.round(e.points, 4).tobytes()) for e in raw):
+        digest.update(repr(row).encode())
+    evidence = sum(element.length * element.observations for element in raw)
+    low, high = points.min(axis=0), points.max(axis=0)
+    observed = raw.provenance.get("observed")
+    return _Entry(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed)
+
+
+def _partners(entries: Sequence[_Entry], most: int) -> list[tuple[int, list[int]]]:
+    """Return for each map those that it shares ground with and comes before, neighbours after neighbours."""
+    boxes = [shapely.box(*(entry.low - 5.0), *(entry.high + 5.0)) for entry in entries]
+    chosen: set[tuple[int, int]] = set()
+    if len(entries) > 1:
+        rows, others = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+        for row in range(len(entries)):
+            near = [int(other) for other in others[rows == row] if other != row]
+            area = {other: round(shapely.intersection(boxes[row], boxes[other]).area, 3) for other in near}
+            best = sorted(near, key=lambda other: (-area[other], other))[:most]
+            chosen.update((min(row, other), max(row, other)) for other in best)
+    tasks = [
+        (entry.place, [entries[b].place for a, b in sorted(chosen) if a == row]) for row, entry in enumerate(entries)
+    ]
+    spot = {entry.place: tuple(np.floor(entry.centre / 200.0)[::-1].tolist()) for entry in entries}
+    return sorted((task for task in tasks if task[1]), key=lambda task: spot[task[0]])
+
+
+def _align_with(shelf: _Shelf, place: int, others: Sequence[int]) -> list[tuple[int, int, Alignment]]:
+    """Align one map with each of several others."""
+    source = shelf.landmarks(place)
+    return [(place, other, align(source, shelf.landmarks(other))) for other in others]
+
+
+def _fuse_tile(
+    shelf: _Shelf, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
+) -> tuple[list[Piece], list[MapElement]]:
+    """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings."""
+    low, high = tile.low - config.margin, tile.high + config.margin
+    loaded = []
+    for place in places:
+        global_map, ground = shelf.corrected(place)
+        around = Looks(part for element in global_map for part in _in_box(element, low, high))
+        loaded.append((place, global_map, ground, around))
+    pieces: list[Piece] = []
+    rings: list[MapElement] = []
+    for kind in ElementKind:
+        contributions = []
+        for place, global_map, ground, looks in loaded:
+            parts = (part for element in global_map.of_kind(kind) for part in _in_box(element, low, high))
+            elements = [_named(part, names[place]) for part in parts]
+            contributions.append(Contribution(place, elements, ground, looks))
+        if kind.is_ring:
+            rings.extend(ring for ring in fuse_rings(contributions, config) if _owns(tile, ring))
+            continue
+        for piece in fuse_lines(kind, contributions, config):
+            for points, values in cut_line(piece.points, piece.values, tile.low, tile.high):
+                pieces.append(replace(piece, points=points, values=values))
+    return pieces, rings
+
+
+def _named(element: MapElement, name: str) -> MapElement:
+    """Return an element that says where it comes from: what it says already, or the map that holds it."""
+    return element.with_origins({source or name: tracks for source, tracks in element.origins.items()})
+
+
+def _in_box(element: MapElement, low: Float, high: Float) -> list[MapElement]:
+    """Return the parts of a line inside a box, or a crossing as a whole if it touches the box."""
+    if (element.points.max(axis=0) < low).any() or (element.points.min(axis=0) >= high).any():
+        return []
+    if element.kind.is_ring:
+        return [element]
+    deviation = element.deviation
+    values = np.zeros((len(element.points), 0)) if deviation is None else deviation[:, None]
+    return [
+        replace(element, points=points, deviation=None if deviation is None else part[:, 0])
+        for points, part in cut_line(element.points, values, low, high)
+    ]
+
+
+def _owns(tile: Tile, ring: MapElement) -> bool:
+    """Whether the middle of a crossing lies in a tile."""
+    middle = (ring.points.min(axis=0) + ring.points.max(axis=0)) / 2
+    return bool((middle >= tile.low).all() and (middle < tile.high).all())

@@ -1,0 +1,1 @@
+"""The nuScenes schema, as the demo world writes it."""

@@ -1,0 +1,1 @@
+"""Camera images and lidar sweeps of a world."""

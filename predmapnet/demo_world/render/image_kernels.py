@@ -1,0 +1,356 @@
+"""The loops over an image: shade every pixel, mirror the scene in wet ground, and turn light into bytes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from predmapnet.demo_world.render.ground_texture import Pyramid
+from predmapnet.demo_world.render.jit import kernel, part
+from predmapnet.demo_world.render.mesh import Mesh
+from predmapnet.demo_world.render.raster import Vector, View, ball_depth, face_plane, pixel_ray
+from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
+from predmapnet.demo_world.street.looks import Light
+
+Byte = NDArray[np.uint8]
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Integer = NDArray[np.int64]
+Integer32 = NDArray[np.int32]
+
+
+class Surroundings(NamedTuple):
+    """All that is the same for every pixel of an image.
+
+    Attributes:
+        fine, coarse: the ground.
+        light: light of the scene.
+        white, fractal, clouds: noise tiles.
+        lamps: ``(rows, columns) float32``, light of street lamps on the ground, one cell per metre.
+        lamps_origin: ``(2,) float64``, metres.
+        global_to_ego: ``(4, 4) float64``.
+        sunlit: ``(solids,) float32``, share of the sun that reaches the foot of each solid.
+    """
+
+    fine: Pyramid
+    coarse: Pyramid
+    light: Light
+    white: Float32
+    fractal: Float32
+    clouds: Float32
+    lamps: Float32
+    lamps_origin: Float
+    global_to_ego: Float
+    sunlit: Float32
+
+
+@part
+def _lamp_light(around: Surroundings, x: float, y: float) -> float:
+    column, row = int(np.floor(x - around.lamps_origin[0])), int(np.floor(y - around.lamps_origin[1]))
+    rows, columns = around.lamps.shape
+    if row < 0 or column < 0 or row >= rows - 1 or column >= columns - 1:
+        return 0.0
+    u, v = x - around.lamps_origin[0] - column, y - around.lamps_origin[1] - row
+    top = around.lamps[row, column] * (1 - u) + around.lamps[row, column + 1] * u
+    low = around.lamps[row + 1, column] * (1 - u) + around.lamps[row + 1, column + 1] * u
+    return float(top * (1 - v) + low * v)
+
+
+@part
+def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
+    clear = np.exp(-light.haze * distance)
+    return (
+        colour[0] * clear + (1 - clear) * light.horizon[0],
+        colour[1] * clear + (1 - clear) * light.horizon[1],
+        colour[2] * clear + (1 - clear) * light.horizon[2],
+    )
+
+
+@part
+def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient: float, facing: float) -> Colour:
+    """Irradiance from the sun, the sky, headlights (``facing``: cosine towards the car) and lamps."""
+    light = around.light
+    lamps = 0.0
+    if light.lamps > 0:
+        lamps = light.lamps * _lamp_light(around, x, y)
+    beam = 0.0
+    if light.headlights > 0:
+        beam = headlight(light, around.global_to_ego, x, y, z) * facing
+    return (
+        light.sun[0] * sun + light.ambient[0] * ambient + beam + 1.0 * lamps,
+        light.sun[1] * sun + light.ambient[1] * ambient + 0.96 * beam + 0.72 * lamps,
+        light.sun[2] * sun + light.ambient[2] * ambient + 0.88 * beam + 0.42 * lamps,
+    )
+
+
+@part
+def _ground_colour(
+    around: Surroundings, view: View, px: float, py: float, ray: Vector, dynamic: float, most: int
+) -> Colour:
+    """Radiance of the ground seen at pixel position (px, py) along ``ray`` (camera depth 1)."""
+    rotation, light = view.rotation, around.light
+    depth = -view.position[2] / ray[2]
+    x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
+    tilt_u, tilt_v = rotation[2, 0] / view.focal_x / ray[2], rotation[2, 1] / view.focal_y / ray[2]
+    ux = depth * (rotation[0, 0] / view.focal_x - ray[0] * tilt_u)
+    uy = depth * (rotation[1, 0] / view.focal_x - ray[1] * tilt_u)
+    vx = depth * (rotation[0, 1] / view.focal_y - ray[0] * tilt_v)
+    vy = depth * (rotation[1, 1] / view.focal_y - ray[1] * tilt_v)
+    red, green, blue, shade = read_ground(around.fine, around.coarse, around.white, x, y, ux, uy, vx, vy, most)
+    distance = depth * np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+    sun = light.sun_direction[2] * shade * (1.0 if dynamic > 0.99 else dynamic)
+    facing = min(1.0, 0.25 + 3.0 * view.position[2] / distance)
+    lit = _lit(around, x, y, 0.0, sun, (0.75 + 0.25 * shade) * (0.25 + 0.75 * dynamic), facing)
+    return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), distance)
+
+
+@part
+def _sky_mirror(
+    around: Surroundings, ray: Vector, length: float, nx: float, ny: float, nz: float
+) -> tuple[float, float, float, float]:
+    """Sky seen in a smooth surface, and Schlick's share of reflection."""
+    x, y, z = ray[0] / length, ray[1] / length, ray[2] / length
+    cosine = -(x * nx + y * ny + z * nz)
+    mirrored_x, mirrored_y, mirrored_z = x + 2 * cosine * nx, y + 2 * cosine * ny, z + 2 * cosine * nz
+    fresnel = 0.05 + 0.95 * max(0.0, 1 - cosine) ** 5
+    dim = 1.0 if mirrored_z > 0.25 else max(0.15, 0.25 + 3.0 * mirrored_z)
+    red, green, blue = sky(around.light, around.clouds, mirrored_x, mirrored_y, max(mirrored_z, 0.02))
+    return min(red, 2.0) * dim, min(green, 2.0) * dim, min(blue, 2.0) * dim, fresnel
+
+
+@part
+def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth: float, ray: Vector) -> Colour:
+    light = around.light
+    length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+    x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
+    nx, ny, nz = mesh.normals[face, 0], mesh.normals[face, 1], mesh.normals[face, 2]
+    material, owner = mesh.materials[face], mesh.owners[face]
+    red, green, blue = mesh.colours[face, 0], mesh.colours[face, 1], mesh.colours[face, 2]
+    glass = lit_window = 0.0
+    if material == 1:
+        along = (y - mesh.corners[face, 0, 1]) * nx - (x - mesh.corners[face, 0, 0]) * ny if abs(nz) < 0.5 else 0.0
+        blur = depth / view.focal_x / max(0.15, -(ray[0] * nx + ray[1] * ny) / length)
+        red, green, blue, glass, lit_window = facade(light, around.fractal, owner, along, z, blur, red, green, blue)
+    elif material == 3 or material == 10 or material == 0:
+        dirt = 0.85 + 0.3 * smooth_noise(around.fractal, (x - y) * 9, (y + z) * 9)
+        red, green, blue = red * dirt, green * dirt, blue * dirt
+    sun = max(0.0, nx * light.sun_direction[0] + ny * light.sun_direction[1] + nz * light.sun_direction[2])
+    shadow = around.sunlit[owner]
+    sun *= shadow + (1 - shadow) * min(1.0, max(0.0, (z - 3.0) / 8.0))
+    # Close to the ground less of the sky is seen, but light comes back from the road.
+    ambient = (0.62 + 0.38 * nz) * (0.6 + 0.4 * min(1.0, z / 1.2))
+    towards = -(nx * ray[0] + ny * ray[1] + nz * ray[2]) / length
+    lit = _lit(around, x, y, z, sun, ambient, max(0.0, towards))
+    colour = (red * lit[0], green * lit[1], blue * lit[2])
+    if material == 4 or material == 5 or glass > 0.02:
+        mirror = _sky_mirror(around, ray, length, nx, ny, nz)
+        share = mirror[3] * (0.5 if material == 4 else 1.0)
+        if material == 5:
+            share = 0.12 + 0.88 * share
+        elif material == 1:
+            share = glass * (0.25 + 0.75 * share)
+        colour = (
+            colour[0] * (1 - share) + mirror[0] * share, colour[1] * (1 - share) + mirror[1] * share,
+            colour[2] * (1 - share) + mirror[2] * share,
+        )  # fmt: skip
+    if lit_window > 0:
+        colour = (colour[0] + 0.55 * lit_window, colour[1] + 0.42 * lit_window, colour[2] + 0.22 * lit_window)
+    if light.lamps > 0:
+        if material == 6:
+            colour = (colour[0] + 3.0 * light.lamps, colour[1] + 2.8 * light.lamps, colour[2] + 2.4 * light.lamps)
+        elif material == 7:
+            colour = (colour[0] + 1.3 * light.lamps, colour[1] + 0.08 * light.lamps, colour[2] + 0.06 * light.lamps)
+        elif material == 8 and nz < -0.5:
+            colour = (colour[0] + 6.0 * light.lamps, colour[1] + 4.6 * light.lamps, colour[2] + 3.0 * light.lamps)
+    return _hazy(light, colour, depth * length)
+
+
+@part
+def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth: float, ray: Vector) -> Colour:
+    light, balls = around.light, mesh.balls
+    length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+    x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
+    nx, ny, nz = (
+        (x - balls[index, 0]) / balls[index, 3] ** 2,
+        (y - balls[index, 1]) / balls[index, 4] ** 2,
+        (z - balls[index, 2]) / balls[index, 5] ** 2,
+    )
+    norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx / norm, ny / norm, nz / norm
+    red, green, blue = mesh.ball_colours[index, 0], mesh.ball_colours[index, 1], mesh.ball_colours[index, 2]
+    shine = nx * light.sun_direction[0] + ny * light.sun_direction[1] + nz * light.sun_direction[2]
+    ambient = 0.6 + 0.4 * nz
+    if mesh.ball_materials[index] == 2:
+        # Three planes, weighted by how squarely the surface faces each: no direction is stretched.
+        weight_x, weight_y, weight_z = nx * nx, ny * ny, nz * nz
+        fine = weight_x * smooth_noise(around.white, y * 17, z * 17) + weight_y * smooth_noise(
+            around.white, x * 17, z * 17
+        )
+        fine += weight_z * smooth_noise(around.white, x * 17, y * 17)
+        clump = weight_x * smooth_noise(around.fractal, y * 22, z * 22)
+        clump += weight_y * smooth_noise(around.fractal, x * 22, z * 22)
+        clump += weight_z * smooth_noise(around.fractal, x * 22, y * 22)
+        fade = min(1.0, max(0.0, 1.3 - depth / view.focal_x * 9))
+        texture = 0.25 + 1.1 * clump + 0.8 * fade * (fine - 0.5)
+        red, green, blue = red * texture, green * texture, blue * texture
+        shine = 0.35 * shine + 0.35
+        shine *= 0.5 + clump
+        ambient *= 0.55 + 0.45 * min(1.0, max(0.0, (z - balls[index, 2]) / balls[index, 5] + 1.0))
+    lit = _lit(around, x, y, z, max(0.0, shine), ambient, 0.7)
+    return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), depth * length)
+
+
+@kernel
+def shade_image(
+    around: Surroundings, mesh: Mesh, view: View, samples: int, most: int, ids: Integer32, nearness: Float32,
+    dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
+) -> None:  # fmt: skip
+    """Shade all pixels; each face in a pixel is shaded once, weighted by the samples that it covers.
+
+    Args:
+        around, mesh, view: what is seen.
+        samples: per pixel and direction.
+        most: largest number of ground samples along a footprint.
+        ids, nearness: z-buffer, ``(samples * height, samples * width)``.
+        dynamic: ``(height, width)``, 255 where no moving thing darkens the ground.
+        found, scratch: ``(16,)`` and ``(4, 16)``, overwritten.
+        image: ``(height, width, 3)`` receives linear radiance.
+        depth: ``(height, width)`` receives metres along the optical axis, infinite for the sky.
+        ground_share: ``(height, width)`` receives how much of a pixel is ground.
+    """
+    faces = len(mesh.counts)
+    weight, sum_x, sum_y, close = scratch[0], scratch[1], scratch[2], scratch[3]
+    each = 1.0 / (samples * samples)
+    for row in range(view.height):
+        for column in range(view.width):
+            kinds = 0
+            for i in range(samples):
+                for j in range(samples):
+                    near = nearness[row * samples + i, column * samples + j]
+                    number = ids[row * samples + i, column * samples + j]
+                    x, y = column + (j + 0.5) / samples, row + (i + 0.5) / samples
+                    slot = 0
+                    while slot < kinds and found[slot] != number:
+                        slot += 1
+                    if slot == kinds:
+                        kinds += 1
+                        found[slot], weight[slot], sum_x[slot], sum_y[slot], close[slot] = number, 0.0, 0.0, 0.0, 0.0
+                    weight[slot] += each
+                    sum_x[slot] += each * x
+                    sum_y[slot] += each * y
+                    close[slot] = max(close[slot], near)
+            red = green = blue = share_of_ground = 0.0
+            best, best_depth = -1.0, np.inf
+            for slot in range(kinds):
+                number, part = found[slot], weight[slot]
+                x, y = sum_x[slot] / part, sum_y[slot] / part
+                if number < 0:
+                    # Only solids need the centre of what they cover: ground and sky are evaluated at the pixel's.
+                    x, y = column + 0.5, row + 0.5
+                ray = pixel_ray(view, x, y)
+                here = np.inf
+                if number < 0:
+                    if ray[2] < -1e-5:
+                        colour = _ground_colour(around, view, x, y, ray, dynamic[row, column] / 255.0, most)
+                        share_of_ground += part
+                        here = -view.position[2] / ray[2]
+                    else:
+                        length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+                        colour = sky(around.light, around.clouds, ray[0] / length, ray[1] / length, ray[2] / length)
+                elif number < faces:
+                    plane = face_plane(mesh.corners, mesh.normals, number, view)
+                    shaded = 1 / max(plane[0] * x + plane[1] * y + plane[2], 1e-6)
+                    colour = _face_colour(around, mesh, view, number, shaded, ray)
+                    here = plane[0] * (column + 0.5) + plane[1] * (row + 0.5) + plane[2]
+                    here = 1 / here if here > 0.5 * close[slot] and here < 2 * close[slot] else 1 / close[slot]
+                else:
+                    shaded = ball_depth(mesh.balls, number - faces, view, x, y)
+                    if shaded <= 0:
+                        shaded = 1 / close[slot]
+                    colour = _ball_colour(around, mesh, view, number - faces, shaded, ray)
+                    here = ball_depth(mesh.balls, number - faces, view, column + 0.5, row + 0.5)
+                    if here <= 0:
+                        here = 1 / close[slot]
+                red, green, blue = red + part * colour[0], green + part * colour[1], blue + part * colour[2]
+                if part > best + 1e-9 or (part > best - 1e-9 and here < best_depth):
+                    best, best_depth = part, here
+            image[row, column, 0], image[row, column, 1], image[row, column, 2] = red, green, blue
+            depth[row, column] = best_depth
+            ground_share[row, column] = share_of_ground
+
+
+@kernel
+def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image: Float32) -> None:
+    """Add to wet ground what it mirrors, smeared vertically as rough water does; see :func:`shade_image`."""
+    light, rotation = around.light, view.rotation
+    for row in range(view.height):
+        for column in range(view.width):
+            if ground_share[row, column] < 0.01:
+                continue
+            ray = pixel_ray(view, column + 0.5, row + 0.5)
+            if ray[2] > -1e-5:
+                continue
+            length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+            depth = -view.position[2] / ray[2]
+            x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
+            puddle = smooth_noise(around.fractal, x * 1.7, y * 1.7)
+            smooth = light.wetness * (0.35 + 0.65 * min(1.0, max(0.0, (puddle - 0.45) * 4)))
+            fresnel = 0.02 + 0.98 * max(0.0, 1 + ray[2] / length) ** 5
+            share = smooth * fresnel * ground_share[row, column]
+            red = green = blue = 0.0
+            for step in range(4):
+                # The ripple tilts the mirrored ray up and down.
+                lift = -ray[2] * (0.55 + 0.45 * step)
+                local_x = rotation[0, 0] * ray[0] + rotation[1, 0] * ray[1] + rotation[2, 0] * lift
+                local_y = rotation[0, 1] * ray[0] + rotation[1, 1] * ray[1] + rotation[2, 1] * lift
+                local_z = rotation[0, 2] * ray[0] + rotation[1, 2] * ray[1] + rotation[2, 2] * lift
+                seen = False
+                if local_z > 0.05:
+                    i = int(local_y / local_z * view.focal_y + view.centre_y)
+                    j = int(local_x / local_z * view.focal_x + view.centre_x)
+                    if 0 <= i < view.height and 0 <= j < view.width and ground_share[i, j] == 0:
+                        red, green, blue = red + image[i, j, 0], green + image[i, j, 1], blue + image[i, j, 2]
+                        seen = True
+                if not seen:
+                    norm = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + lift * lift)
+                    colour = sky(light, around.clouds, ray[0] / norm, ray[1] / norm, lift / norm)
+                    red, green, blue = red + colour[0], green + colour[1], blue + colour[2]
+            image[row, column, 0] += share * (red / 4 - image[row, column, 0])
+            image[row, column, 1] += share * (green / 4 - image[row, column, 1])
+            image[row, column, 2] += share * (blue / 4 - image[row, column, 2])
+
+
+@kernel
+def develop(image: Float32, exposure: float, vignette: float, noise: float, seed: int, curve: Byte, out: Byte) -> None:
+    """Expose, add sensor noise and apply the tone curve.
+
+    Args:
+        image: ``(height, width, 3)`` linear radiance.
+        exposure: factor.
+        vignette: share of light that the corners lose.
+        noise: standard deviation at middle grey.
+        seed: of the noise.
+        curve: ``(4096,)``, from the square root of linear light (0 to 1.25) to sRGB bytes.
+        out: ``(height, width, 3)``.
+    """
+    height, width = out.shape[0], out.shape[1]
+    state = np.uint64(seed) * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+    spread = np.float32(1.0 / (1 << 16) / 0.408)
+    for row in range(height):
+        y = (row + 0.5) / height - 0.5
+        for column in range(width):
+            x = (column + 0.5) / width - 0.5
+            gain = exposure * (1 - vignette * 2 * (x * x + y * y))
+            state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+            mixed = state ^ (state >> np.uint64(29))
+            for channel in range(3):
+                value = image[row, column, channel] * gain
+                # The sum of two bytes is nearly normal, with standard deviation 0.408 of its reach.
+                low = np.float32((mixed >> np.uint64(16 * channel)) & np.uint64(255))
+                high = np.float32((mixed >> np.uint64(16 * channel + 8)) & np.uint64(255))
+                random = (low + high - np.float32(255.0)) * spread * np.float32(256.0)
+                value += random * noise * np.sqrt(max(value, 0.0) * 0.18 + 0.004)
+                index = int(np.sqrt(max(value, 0.0)) * (4095 / 1.25))
+                out[row, column, channel] = curve[min(index, 4095)]

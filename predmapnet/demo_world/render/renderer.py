@@ -1,0 +1,227 @@
+"""What a camera sees: images with exact depth of a world, at any resolution."""
+
+from __future__ import annotations
+
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapfusion.geometry import inverse_pose
+from predmapnet.demo_world.render.ground_texture import Pyramid, paint_ground
+from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
+from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
+from predmapnet.demo_world.render.noise import fractal_tile
+from predmapnet.demo_world.render.raster import View, draw_balls, draw_faces, draw_mask
+from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
+from predmapnet.demo_world.street.looks import light_of
+from predmapnet.demo_world.world import Solids, World
+from predmapnet.scenes import Camera, Rig
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """One image of one camera.
+
+    Attributes:
+        image: ``(height, width, 3) uint8``, RGB.
+        depth: ``(height, width) float32``, metres along the optical axis at the pixel's centre, infinite for sky.
+    """
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+
+
+def _tone_curve() -> NDArray[np.uint8]:
+    """From the square root of linear light to sRGB bytes, with a soft shoulder above white paper."""
+    linear = (np.arange(4096) / 4095 * 1.25) ** 2
+    shoulder = np.where(linear < 0.6, linear, 0.6 + 0.4 * (1 - np.exp(-(linear - 0.6) / 0.4)))
+    encoded = np.where(shoulder <= 0.0031308, 12.92 * shoulder, 1.055 * shoulder ** (1 / 2.4) - 0.055)
+    return np.round(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
+
+
+def _lamp_field(world: World) -> tuple[NDArray[np.float32], Float]:
+    """Light of the street lamps on the ground, a cell per metre, and the position of cell (0, 0)."""
+    positions = world.trajectory.ego_to_global[:, :2, 3]
+    low, high = np.floor(positions.min(axis=0) - 130), np.ceil(positions.max(axis=0) + 130)
+    field = np.zeros((int(high[1] - low[1]), int(high[0] - low[0])), dtype=np.float32)
+    reach = 24
+    for lamp in world.solids.centre[world.solids.texture == "lamp"]:
+        column, row = (lamp[:2] - low).astype(int)
+        rows = slice(max(row - reach, 0), max(row + reach, 0))
+        columns = slice(max(column - reach, 0), max(column + reach, 0))
+        window = field[rows, columns]
+        if window.size:
+            y, x = np.mgrid[rows, columns][:, : window.shape[0], : window.shape[1]]
+            square = (x - (lamp[0] - low[0])) ** 2 + (y - (lamp[1] - low[1])) ** 2
+            # Lambert's cosine and the inverse square of the distance, normalised below the lamp.
+            window += (0.55 * (lamp[2] ** 2 / (square + lamp[2] ** 2)) ** 2).astype(np.float32)
+    return field, low
+
+
+class Renderer:
+    """Draws one world; prepares the ground once (about two seconds), then renders any camera at any frame.
+
+    Args:
+        world: what to draw.
+        supersampling: samples per pixel and direction along the edges of solids, 1 to 4.
+        threads: cameras that :meth:`render_frame` draws at once. One for callers that run several processes.
+    """
+
+    def __init__(self, world: World, supersampling: int = 2, threads: int = 1) -> None:
+        if not 1 <= supersampling <= 4:
+            raise ValueError(f"supersampling must be 1 to 4, not {supersampling}")
+        self.world = world
+        self.supersampling = supersampling
+        self.threads = threads
+        self.light = light_of(world.look, world.seed)
+        self._ground = paint_ground(world, self.light)
+        solids = world.solids
+        self._moving = solids.velocity.any(axis=1) | ~solids.always
+        self._standing_mesh = build_mesh(solids, np.flatnonzero(~self._moving))
+        self._sunlit = np.ones(len(solids.shape), dtype=np.float32)
+        if self.light.sun.any():
+            self._sunlit[:] = self._shadow_at(self._ground[0], solids.centre[:, :2], solids)
+        self._lamps, self._lamps_origin = _lamp_field(world)
+        self._curve = _tone_curve()
+
+    @staticmethod
+    def _shadow_at(ground: Pyramid, points: Float, solids: Solids) -> NDArray[np.float32]:
+        """Share of sunlight just outside the sunward side of each solid, from the painted shadows."""
+        level = min(3, len(ground.rows) - 1)
+        x0, y0, cosine, sine, per_metre = ground.placement
+        delta = points - [x0, y0]
+        column = ((cosine * delta[:, 0] + sine * delta[:, 1]) * per_metre).astype(int) >> level
+        row = ((cosine * delta[:, 1] - sine * delta[:, 0]) * per_metre).astype(int) >> level
+        rows, columns = int(ground.rows[level]), int(ground.columns[level])
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        start = int(ground.starts[level])
+        shade = np.ones(len(points), dtype=np.float32)
+        index = start + np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1)
+        shade[inside] = ground.texels[index[inside], 3] / np.float32(255)
+        # A solid always lies in its own shadow: only cars, which are low, take over that of others.
+        shade[solids.texture != "vehicle"] = 1.0
+        return shade
+
+    def solids_at(self, frame_index: int) -> tuple[Solids, NDArray[np.int64]]:
+        """Return the solids with moving ones put where they are at a key frame, and the rows that are there."""
+        solids, trajectory = self.world.solids, self.world.trajectory
+        seconds = float(trajectory.timestamps[frame_index] - trajectory.timestamps[0]) * 1e-9
+        centre = solids.centre.copy()
+        centre[:, :2] += solids.velocity * seconds
+        present = np.ones(len(centre), dtype=bool)
+        if solids.lifetime is not None:
+            present = (solids.lifetime[:, 0] <= seconds) & (seconds < solids.lifetime[:, 1])
+        placed = Solids(
+            solids.shape,
+            centre,
+            solids.size,
+            solids.yaw,
+            solids.colour,
+            solids.texture,
+            solids.velocity,
+            solids.lifetime,
+        )
+        return placed, np.flatnonzero(present)
+
+    def mesh_at(self, frame_index: int) -> tuple[Mesh, Solids, NDArray[np.int64]]:
+        """Return the mesh of a key frame, the solids in place, and the rows of those that move."""
+        placed, present = self.solids_at(frame_index)
+        moving = present[self._moving[present]]
+        return join(self._standing_mesh, build_mesh(placed, moving)), placed, moving
+
+    def _dynamic_mask(self, view: View, placed: Solids, moving: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Ground darkened by what moves, ``(height, width)``, 255 where nothing does."""
+        mask = np.full((view.height, view.width), 255, dtype=np.uint8)
+        chosen = np.zeros(len(placed.shape), dtype=bool)
+        chosen[moving] = True
+        layers: list[tuple[list[Float], int]] = []
+        if self.light.sun.any():
+            layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction)], 90))
+        layers.append(([polygon for polygon, _ in contact_polygons(placed, chosen)], 30))
+        for polygons, value in layers:
+            corners = np.zeros((len(polygons), MOST_CORNERS, 3))
+            counts = np.zeros(len(polygons), dtype=np.int64)
+            for row, polygon in enumerate(polygons):
+                # A face holds few corners: keep evenly spread ones of a round outline.
+                kept = polygon[
+                    np.linspace(0, len(polygon), min(len(polygon), MOST_CORNERS), endpoint=False).astype(int)
+                ]
+                corners[row, : len(kept), :2] = kept
+                counts[row] = len(kept)
+            draw_mask(corners, counts, view, value, np.empty((18, 3)), mask)
+        return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if len(moving) else mask
+
+    def view(self, camera: Camera, frame_index: int) -> View:
+        """Return a camera at a key frame as plain numbers."""
+        pose = self.world.trajectory.ego_to_global[frame_index] @ camera.camera_to_ego
+        k = camera.intrinsics
+        rotation, position = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
+        return View(
+            rotation,
+            position,
+            float(k[0, 0]),
+            float(k[1, 1]),
+            float(k[0, 2]),
+            float(k[1, 2]),
+            camera.width,
+            camera.height,
+        )
+
+    def rasterise(self, mesh: Mesh, view: View, samples: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Return the z-buffer of the solids: ``1 / depth`` and ids, ``(samples * height, samples * width)``."""
+        nearness = np.zeros((view.height * samples, view.width * samples), dtype=np.float32)
+        ids = np.full(nearness.shape, -1, dtype=np.int32)
+        draw_faces(mesh.corners, mesh.counts, mesh.normals, view, samples, np.empty((18, 3)), nearness, ids)
+        leafy = (mesh.ball_materials == Material.FOLIAGE).astype(np.int64)
+        draw_balls(mesh.balls, leafy, len(mesh.counts), view, samples, fractal_tile(0.6, seed=10), nearness, ids)
+        return nearness, ids
+
+    def render(self, camera: Camera, frame_index: int) -> RenderedImage:
+        """Draw what ``camera`` sees at a key frame.
+
+        Args:
+            camera: any pinhole camera without skew; its intrinsics hold for its width and height.
+            frame_index: index into the world's trajectory.
+
+        Returns:
+            The image and its depth; the same bytes for the same world, camera and frame.
+        """
+        mesh, placed, moving = self.mesh_at(frame_index)
+        view, samples = self.view(camera, frame_index), self.supersampling
+        nearness, ids = self.rasterise(mesh, view, samples)
+        around = Surroundings(
+            *self._ground, self.light, fractal_tile(0.0, seed=8), fractal_tile(1.0), fractal_tile(1.7, seed=12),
+            self._lamps, self._lamps_origin, inverse_pose(self.world.trajectory.ego_to_global[frame_index]),
+            self._sunlit,
+        )  # fmt: skip
+        size = (camera.height, camera.width)
+        image = np.empty((*size, 3), dtype=np.float32)
+        depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
+        dynamic = self._dynamic_mask(view, placed, moving)
+        found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
+        shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, found, scratch, image, depth, ground_share)
+        if self.light.wetness > 0:
+            mirror_in_wet(around, view, ground_share, image)
+        image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0.5 * camera.width / 800), dtype=np.float32)
+        name = zlib.crc32(camera.name.encode())
+        generator = np.random.default_rng([self.world.seed, name])
+        exposure = self.light.exposure * float(np.exp(generator.normal(0, 0.06)))
+        vignette = float(generator.uniform(0.12, 0.32))
+        seed = int(np.random.default_rng([self.world.seed, name, frame_index]).integers(2**31))
+        out = np.empty((*size, 3), dtype=np.uint8)
+        develop(image, exposure, vignette, self.light.noise / 0.18**0.5 / 0.42, seed, self._curve, out)
+        return RenderedImage(out, depth)
+
+    def render_frame(self, rig: Rig, frame_index: int) -> dict[str, RenderedImage]:
+        """Draw all cameras of a rig at a key frame, ``threads`` at a time; by camera name."""
+        if self.threads == 1:
+            return {camera.name: self.render(camera, frame_index) for camera in rig}
+        with ThreadPoolExecutor(self.threads) as pool:
+            images = pool.map(lambda camera: self.render(camera, frame_index), rig)
+            return {camera.name: image for camera, image in zip(rig, images, strict=True)}

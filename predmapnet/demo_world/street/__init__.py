@@ -1,0 +1,1 @@
+"""From a vector map to a street: looks, furniture, traffic."""

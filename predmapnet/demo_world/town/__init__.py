@@ -1,0 +1,1 @@
+"""Towns: plan, roads, junctions and the drives through them."""

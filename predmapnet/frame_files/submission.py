@@ -1,0 +1,189 @@
+"""Submissions in JSON as StreamMapNet and MapTracker write them: elements per frame, without poses or truth.
+
+Two layouts are read; further keys are ignored.
+
+* ``submission_vector.json``: ``{"results": {token: {"vectors", "scores", "labels"}}}``. The token is the sample token
+  on nuScenes and the lidar time stamp on Argoverse 2 (``<log>_<timestamp>`` is taken too). A frame without predictions
+  may be absent. It carries no tracks, unless an entry has ``global_ids`` beside the rest.
+* The content of ``pos_predictions.pkl``, saved as JSON: a list of ``{"scene_name", "local_idx", "vectors", "scores",
+  "labels", "global_ids"}``, tracked elements only.
+
+A vector is a list of ``[x, y]``, further coordinates dropped, or the flat list ``x0, y0, x1, y1, ...``; metres, ego
+frame (x forward, y left). Labels are 0 ped_crossing, 1 divider, 2 boundary. An entry may say what ground could be seen
+with ``visible``, a list of rings, which are lists of points like vectors; a ring within another is a hole.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from mapfusion.elements import FrameMap, RegionOfInterest
+from predmapnet.errors import UserError
+from predmapnet.frame_files.parquet import refuse_pickle
+from predmapnet.scenes import Instant
+
+Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+_ENOUGH_TO_JUDGE = 10
+"""Elements; if so many lie between 0 and 1 m, all of them, the file holds normalised points."""
+
+
+@dataclass(frozen=True)
+class SubmittedFrame:
+    """The elements of one frame.
+
+    Attributes:
+        kinds: ``(n,) int64``; ids 0 ped_crossing, 1 divider, 2 boundary.
+        scores: ``(n,) float64``.
+        track_ids: ``(n,) int64``; -1 where the submission has none.
+        polylines: arrays ``(k, 2) float64``, metres, ego frame.
+        visible: rings around the ground that could be seen, as in ``FrameMap.visible``; None for all.
+    """
+
+    kinds: Integer
+    scores: Float
+    track_ids: Integer
+    polylines: tuple[Float, ...]
+    visible: tuple[Float, ...] | None = None
+
+    def at(self, instant: Instant, roi: RegionOfInterest) -> FrameMap:
+        """Put the elements where and when the data set says that the frame was taken."""
+        return FrameMap(
+            instant.timestamp,
+            instant.ego_to_global,
+            roi,
+            self.kinds,
+            self.scores,
+            self.track_ids,
+            self.polylines,
+            visible=self.visible,
+        )
+
+
+NOTHING = SubmittedFrame(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int64), ())
+
+
+def position_name(scene: str, index: int) -> str:
+    """How a frame is called in :func:`read_submission` if the file names its scene and its place in it."""
+    return f"{scene}/{index}"
+
+
+def read_submission(path: Path) -> dict[str, SubmittedFrame]:
+    """Read a submission in one of the layouts above.
+
+    Args:
+        path: JSON file.
+
+    Returns:
+        The frames by the data set's token, or by :func:`position_name`.
+
+    Raises:
+        UserError: no such file, a pickle, no JSON, or a frame that is not as described; the message names it.
+    """
+    if not path.is_file():
+        raise UserError(f"There is no file {path}.")
+    refuse_pickle(path)
+    content = _load(path)
+    results = content.get("results") if isinstance(content, dict) else content
+    frames: dict[str, SubmittedFrame] = {}
+    for name, entry in _entries(path, results):
+        if name in frames:
+            raise UserError(f"{path} holds the frame {name} twice.")
+        frames[name] = _frame_of(f"{path}, frame {name}", entry)
+    if not frames:
+        raise UserError(f"{path} holds no frame.")
+    _check_metres(path, frames)
+    return frames
+
+
+def _load(path: Path) -> Any:
+    data = path.read_bytes()
+    try:
+        return orjson.loads(data)
+    except orjson.JSONDecodeError:
+        pass
+    try:
+        # Python's own writer puts NaN into files; read it, so that the element can be named that holds it.
+        return json.loads(data)
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path} is not valid JSON: {error}.") from error
+
+
+def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
+    """Give the name and the entry of each frame, whichever layout it is."""
+    if isinstance(results, dict):
+        yield from results.items()
+    elif isinstance(results, list) and any("sample_token" in entry for entry in results if isinstance(entry, dict)):
+        raise UserError(
+            f"{path} is a result file of MapTR (a list with 'sample_token'), whose classes have other numbers and "
+            "whose axes on nuScenes are the lidar's. Convert it first: labels by cls_name to 0 ped_crossing, "
+            "1 divider, 2 boundary, and on nuScenes (x, y) to (y, -x)."
+        )
+    elif isinstance(results, list):
+        for number, entry in enumerate(results):
+            if not isinstance(entry, dict) or "scene_name" not in entry or "local_idx" not in entry:
+                raise UserError(f"{path}, entry {number}: a list of frames needs scene_name and local_idx in each.")
+            yield position_name(entry["scene_name"], entry["local_idx"]), entry
+    else:
+        raise UserError(f"{path} is no submission: it has no object 'results' with one entry per frame token.")
+
+
+def _frame_of(where: str, entry: Any) -> SubmittedFrame:
+    if not isinstance(entry, dict):
+        raise UserError(f"{where}: an object with vectors, scores and labels is expected, not {str(entry)[:40]}.")
+    missing = [key for key in ("vectors", "scores", "labels") if key not in entry]
+    if missing:
+        raise UserError(f"{where}: {' and '.join(missing)} missing.")
+    kinds = _numbers(f"{where}, labels", entry["labels"], np.int64)
+    scores = _numbers(f"{where}, scores", entry["scores"], np.float64)
+    ids = entry.get("global_ids")
+    track_ids = np.full(len(kinds), -1) if ids is None else _numbers(f"{where}, global_ids", ids, np.int64)
+    if not isinstance(entry["vectors"], list):
+        raise UserError(f"{where}: vectors must be a list.")
+    polylines = tuple(_polyline(f"{where}, vector {row}", vector) for row, vector in enumerate(entry["vectors"]))
+    counts = (len(polylines), len(scores), len(kinds), len(track_ids))
+    if len(set(counts)) != 1:
+        raise UserError(f"{where}: {counts[0]} vectors, {counts[1]} scores, {counts[2]} labels and {counts[3]} ids.")
+    rings = entry.get("visible")
+    if rings is not None and not isinstance(rings, list):
+        raise UserError(f"{where}: visible must be a list of rings.")
+    visible = None if rings is None else tuple(_polyline(f"{where}, visible ring {i}", r) for i, r in enumerate(rings))
+    return SubmittedFrame(kinds, scores, track_ids, polylines, visible)
+
+
+def _numbers(where: str, values: Any, kind: type[np.generic]) -> NDArray[Any]:
+    try:
+        numbers = np.array(values, dtype=np.float64).reshape(-1)
+        whole = numbers.astype(kind)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where} are not numbers: {error}.") from error
+    if kind is np.int64 and not (whole == numbers).all():
+        raise UserError(f"{where} are not all whole numbers: {numbers.tolist()[:5]}.")
+    return whole
+
+
+def _polyline(where: str, vector: Any) -> Float:
+    try:
+        points = np.array(vector, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{where} is not a list of points: {error}.") from error
+    if points.ndim == 1 and points.size % 2 == 0:
+        return points.reshape(-1, 2)
+    if points.ndim != 2 or points.shape[1] < 2:
+        raise UserError(f"{where} has the shape {points.shape}; points as [x, y] or x0, y0, x1, y1, ... are expected.")
+    return points[:, :2]
+
+
+def _check_metres(path: Path, frames: Mapping[str, SubmittedFrame]) -> None:
+    lines = [line for frame in frames.values() for line in frame.polylines]
+    if len(lines) >= _ENOUGH_TO_JUDGE and all(((line >= 0.0) & (line <= 1.0)).all() for line in lines):
+        raise UserError(f"{path}: all points lie between 0 and 1, so they are normalised; metres are expected.")

@@ -1,0 +1,146 @@
+"""Walk through a scene frame by frame: read images ahead, map, integrate, and let observers watch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Protocol
+
+from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
+from mapfusion.integrate.integrator import MapIntegrator
+from predmapnet.errors import UserError
+from predmapnet.field_of_view import seen_in
+from predmapnet.fusion import NETWORK_ERRORS
+from predmapnet.mapper import CameraImages, Mapper
+from predmapnet.scenes import Frame, Scene
+
+MapSnapshot = Callable[[], GlobalMap]
+"""Gives the global map as it is now; costs time that grows with the map, so ask seldom."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One frame, mapped.
+
+    Attributes:
+        frame: what the car saw.
+        frame_map: what the mapper made of it, rasters included.
+        milliseconds: by stage: ``images`` (waiting for them), ``network``, ``integration``.
+    """
+
+    frame: Frame
+    frame_map: FrameMap
+    milliseconds: Mapping[str, float]
+
+
+class Observer(Protocol):
+    """Watches a run and changes nothing: a recording, a progress bar."""
+
+    def begin(self, scene: Scene, roi: RegionOfInterest) -> None:
+        """Called once before the first frame."""
+        ...
+
+    def observe(self, step: Step, snapshot: MapSnapshot) -> None:
+        """Called after each frame."""
+        ...
+
+    def end(self, global_map: GlobalMap) -> None:
+        """Called once after the last frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """What came of a scene.
+
+    Attributes:
+        global_map: the map of the whole drive, without provenance.
+        frames: the frames that were mapped.
+        frame_maps: one per frame, without rasters.
+        seconds: wall time from the first image to the last frame.
+        milliseconds: mean per frame, by stage.
+        rejections: what the integrator left out and why, counted by reason.
+    """
+
+    global_map: GlobalMap
+    frames: tuple[Frame, ...]
+    frame_maps: tuple[FrameMap, ...]
+    seconds: float
+    milliseconds: Mapping[str, float]
+    rejections: Mapping[str, int]
+
+    @property
+    def frames_per_second(self) -> float:
+        """Frames mapped per second of wall time."""
+        return len(self.frames) / self.seconds
+
+
+def map_scene(
+    scene: Scene, mapper: Mapper, observers: Sequence[Observer] = (), allow_missing_cameras: bool = False
+) -> SceneRun:
+    """Map a scene from its first frame to its last.
+
+    Args:
+        scene: an opened driving log.
+        mapper: the network; its state begins anew.
+        observers: called at the beginning, after each frame and at the end.
+        allow_missing_cameras: go on where a camera has no image; otherwise that is an error.
+
+    Raises:
+        UserError: there are no frames, an image is damaged or missing, or a pose is broken; the message says which.
+    """
+    if len(scene) == 0:
+        raise UserError(f"{scene.info.name} has no frames: there is nothing to map.")
+    integrator = MapIntegrator(NETWORK_ERRORS)
+    for observer in observers:
+        observer.begin(scene, mapper.roi)
+    start = perf_counter()
+    frames, frame_maps, timings = [], [], []
+    for step in stream(scene, mapper, integrator, allow_missing_cameras):
+        frames.append(step.frame)
+        frame_maps.append(replace(step.frame_map, segmentation=None, history_masks=None))
+        timings.append(step.milliseconds)
+        for observer in observers:
+            observer.observe(step, integrator.map)
+    global_map = integrator.map()
+    seconds = perf_counter() - start
+    for observer in observers:
+        observer.end(global_map)
+    means = {stage: sum(timing[stage] for timing in timings) / len(timings) for stage in timings[0]}
+    return SceneRun(global_map, tuple(frames), tuple(frame_maps), seconds, means, dict(integrator.rejections))
+
+
+def stream(
+    scene: Scene, mapper: Mapper, integrator: MapIntegrator, allow_missing_cameras: bool = False
+) -> Iterator[Step]:
+    """Map frame after frame, adding each to the integrator; images of the next one are read meanwhile."""
+    state = None
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as reader:
+
+        def read(index: int) -> tuple[Frame, CameraImages]:
+            frame = scene.frame(index)
+            return frame, mapper.read_images(frame, allow_missing_cameras=allow_missing_cameras)
+
+        upcoming = reader.submit(read, 0)
+        for index in range(len(scene)):
+            asked = perf_counter()
+            frame, images = upcoming.result()
+            images_ready = perf_counter()
+            if index + 1 < len(scene):
+                upcoming = reader.submit(read, index + 1)
+            frame_map, state = mapper.step(frame, state, images=images)
+            frame_map = replace(frame_map, visible=seen_in(frame, mapper.roi))
+            mapped = perf_counter()
+            integrator.add(frame_map, log=frame.scene)
+            done = perf_counter()
+            yield Step(
+                frame,
+                frame_map,
+                {
+                    "images": 1e3 * (images_ready - asked),
+                    "network": 1e3 * (mapped - images_ready),
+                    "integration": 1e3 * (done - mapped),
+                },
+            )

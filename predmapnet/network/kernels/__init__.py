@@ -1,0 +1,1 @@
+"""Fast arithmetic that knows nothing of maps."""

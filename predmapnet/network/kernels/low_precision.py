@@ -1,0 +1,56 @@
+"""Image backbone and BEV encoder in bfloat16, for machines that multiply such numbers faster.
+
+Only the products are: convolutions and linear layers, which are nearly all of the work. What decides where something is
+looked up (sampling offsets, attention weights), the look-ups themselves, norms, and everything after the BEV encoder
+stay in float32: with eight bits, positions would be off by up to 0.4 % of the map.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
+from predmapnet.network.maptracker.bevformer import BevSelfAttention, ImageCrossAttention
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.precision import Precision
+
+
+def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:
+    """Return the network with its image backbone and BEV encoder in a precision; it is changed in place.
+
+    Args:
+        network: made for inference (:func:`predmapnet.network.kernels.inference.for_inference`).
+        precision: float32 changes nothing.
+    """
+    if precision is Precision.BFLOAT16:
+        for name in ("image_backbone", "bev_encoder"):
+            network.add_module(name, _LowPrecision(network.get_submodule(name)))
+    return network
+
+
+class _LowPrecision(nn.Module):
+    """A part of the network whose products are bfloat16, and whose results are float32."""
+
+    def __init__(self, part: nn.Module) -> None:
+        super().__init__()
+        self.part = part
+        exact = {id(layer) for module in part.modules() for layer in _decide_places(module)}
+        for module in part.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear | DeformableConvolution) and id(module) not in exact:
+                for name, parameter in module.named_parameters(recurse=False):
+                    low = nn.Parameter(parameter.to(torch.bfloat16), requires_grad=False)
+                    module.register_parameter(name, low)
+
+    def forward(self, *arguments: object) -> list[Tensor]:
+        """Compute what the part computes."""
+        return [level.float() for level in self.part(*arguments)]
+
+
+def _decide_places(module: nn.Module) -> list[nn.Module]:
+    """Return the layers that say where a module looks, and how much each place counts."""
+    if isinstance(module, DeformableConvolution):
+        return [module.offsets]
+    if isinstance(module, BevSelfAttention | ImageCrossAttention):
+        return [module.sampling_offsets, module.attention_weights]
+    return []

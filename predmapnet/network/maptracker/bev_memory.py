@@ -1,0 +1,130 @@
+"""Past BEV maps for the BEV encoder: kept, chosen by distance, and warped into the current ego frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from predmapnet.config import EncoderBevMemoryConfig, PredMapNetConfig
+from predmapnet.network.ego_motion import relative_pose
+from predmapnet.network.history_choice import choose_history
+from predmapnet.network.layers import cell_centres
+from predmapnet.network.state import StreamState
+
+
+@dataclass
+class BevHistory:
+    """Chosen past maps, from far to near.
+
+    Attributes:
+        maps: ``(B, S, C, H, W)`` in the current ego frame, zeros where they do not reach and in slots without a map.
+        slots: ``(B, S) int64``, which maps of the memory these are.
+        valid: ``(B, S) bool``.
+    """
+
+    maps: Tensor
+    slots: Tensor
+    valid: Tensor
+
+
+def look_back(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> BevHistory:
+    """Choose past maps and warp them.
+
+    Args:
+        state: of the last frame.
+        ego_to_global: ``(B, 4, 4) float64``, current.
+        config: distances, region and the quirk.
+    """
+    slots, chosen = choose_maps(state, ego_to_global, config)
+    stream = torch.arange(len(slots), device=slots.device)[:, None]
+    current_to_past = relative_pose(ego_to_global[:, None], state.bev_memory_pose[stream, slots])
+    maps = state.bev_memory[stream, slots]
+    grid = warp_grid(current_to_past, config).flatten(0, 1).to(maps.dtype)
+    warped = F.grid_sample(maps.flatten(0, 1), grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    warped = warped.unflatten(0, slots.shape).masked_fill(~chosen[:, :, None, None, None], 0.0)
+    return BevHistory(warped, slots, chosen)
+
+
+def choose_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> tuple[Tensor, Tensor]:
+    """Return which maps of the memory are looked at ``(B, S) int64``, from far to near, and which of these are there.
+
+    Args:
+        state: of the last frame.
+        ego_to_global: ``(B, 4, 4) float64``, current.
+        config: distances.
+    """
+    travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1)
+    return choose_history(travelled, state.bev_memory_valid, config.temporal_bev.distances, fallback="latest")
+
+
+def nearest_pose(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> Tensor:
+    """Return the pose ``(B, 4, 4) float64`` of the nearest map that is looked at; of the last frame if there is none.
+
+    Args:
+        state: of the last frame.
+        ego_to_global: ``(B, 4, 4) float64``, current.
+        config: distances.
+    """
+    if state.bev_memory.shape[1] == 0:
+        return state.ego_to_global
+    slots, _ = choose_maps(state, ego_to_global, config)
+    stream = torch.arange(len(slots), device=slots.device)
+    return state.bev_memory_pose[stream, slots[:, -1]]
+
+
+def keep_map(
+    state: StreamState, bev: Tensor, ego_to_global: Tensor, config: EncoderBevMemoryConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Store the current map; the oldest goes when the memory is full.
+
+    Args:
+        state: of the last frame.
+        bev: ``(B, C, H, W)``.
+        ego_to_global: ``(B, 4, 4) float64``.
+        config: the capacity.
+
+    Returns:
+        The new ``bev_memory``, ``bev_memory_pose`` and ``bev_memory_valid``.
+    """
+    known = state.bev_memory_valid.new_ones(len(bev), 1)
+    kept = slice(-config.capacity, None)
+    return (
+        torch.cat([state.bev_memory, bev[:, None]], dim=1)[:, kept],
+        torch.cat([state.bev_memory_pose, ego_to_global[:, None]], dim=1)[:, kept],
+        torch.cat([state.bev_memory_valid, known], dim=1)[:, kept],
+    )
+
+
+def warp_grid(current_to_past: Tensor, config: PredMapNetConfig) -> Tensor:
+    """Find the cells of the current BEV grid in past maps.
+
+    Rounded where the official code rounds: after :func:`predmapnet.network.ego_motion.warp_bev`, which does the same,
+    the BEV features would differ by more than 2e-5 from the official ones.
+
+    Args:
+        current_to_past: ``(..., 4, 4) float64``.
+        config: size of the grid and the quirk.
+
+    Returns:
+        ``(..., H, W, 2) float32``, as ``grid_sample`` wants it: -1 and 1 are the borders of the map, y downwards.
+    """
+    cells = _cells(config, current_to_past.device)
+    rotation, translation = current_to_past[..., :2, :2], current_to_past[..., :2, 3]
+    past = cells.flatten(0, 1) @ rotation.transpose(-1, -2) + translation[..., None, :]
+    x, y = past.float().unbind(-1)
+    grid = torch.stack([x / (config.roi_length / 2), -y / (config.roi_width / 2)], dim=-1)
+    return grid.unflatten(-2, cells.shape[:2])
+
+
+def _cells(config: PredMapNetConfig, device: torch.device) -> Tensor:
+    """Return the positions ``(H, W, 2) float64`` that are looked up, metres in the current ego frame."""
+    length, width = config.roi_length, config.roi_width
+    if config.quirks.endpoint_warp_grid:  # Released weights saw every past map zoomed by this, rounded to 32 bits.
+        x = torch.linspace(-length / 2, length / 2, config.bev.columns, dtype=torch.float32, device=device)
+        y = torch.linspace(width / 2, -width / 2, config.bev.rows, dtype=torch.float32, device=device)
+        return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).double()
+    x, y = (cell_centres(config.bev.rows, config.bev.columns, device).double() - 0.5).unbind(-1)
+    return torch.stack([x * length, y * width], dim=-1)

@@ -1,0 +1,235 @@
+"""BEV encoder (BEVFormer, Li et al. 2022): learned queries of the ground cells look into the images.
+
+Past BEV maps enter after every layer (MapTracker's BEV memory fusion).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
+from predmapnet.network.kernels.deformable_attention import deformable_attention
+from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.layers import ResidualPerceptron, flatten_cells
+from predmapnet.network.maptracker.bev_memory import look_back
+from predmapnet.network.maptracker.camera_pillars import CameraPillars, pixel_positions
+from predmapnet.network.maptracker.temporal_fusion import TemporalFusion
+from predmapnet.network.state import FrameInputs, RigGeometry, StreamState
+
+IMAGE_LEVELS = 3
+LEVEL_CODES = 4
+"""One more than there are levels: released weights hold a fourth that is never used."""
+
+
+class BevSelfAttention(nn.Module):
+    """Deformable attention of the ground cells to each other.
+
+    BEVFormer's temporal self-attention, of which MapTracker uses half: its queue of two maps holds the current map
+    twice, so the two entries differ in where they look only.
+    """
+
+    QUEUE = 2
+    POINTS = 4
+
+    def __init__(self, config: BevFormerConfig, mirrored: bool) -> None:
+        super().__init__()
+        width, self.heads = config.width, config.heads
+        self.grid = (config.rows, config.columns)
+        self.mirrored = mirrored
+        samples = self.heads * self.QUEUE * self.POINTS
+        self.sampling_offsets = Linear(2 * width, 2 * samples)
+        self.attention_weights = Linear(2 * width, samples)
+        self.value = Linear(width, width)
+        self.output = Linear(width, width)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, cells: Tensor, code: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            cells: ``(B, H * W, C)``.
+            code: ``(H * W, C)``, position code of the cells.
+
+        Returns:
+            ``(B, H * W, C)``, the input included.
+        """
+        batch, count, _ = cells.shape
+        both = torch.cat([cells, cells + code], dim=-1).flatten(0, 1)
+        values = self.value(cells).view(batch * count, self.heads, -1)
+        offsets = self.sampling_offsets(both).view(-1, self.heads, 1, self.QUEUE * self.POINTS, 2)
+        weights = self.attention_weights(both).view(-1, self.heads, self.QUEUE, self.POINTS).softmax(dim=-1)
+        weights = weights.view(-1, self.heads, 1, self.QUEUE * self.POINTS) / self.QUEUE
+        row, column = self._references(cells.device)
+        x = offsets[..., 0].unflatten(0, (batch, count)) + column[:, None, None, None]
+        y = offsets[..., 1].unflatten(0, (batch, count)) + row[:, None, None, None]
+        first_row = _stream_rows(batch, count, count, cells.device)
+        attended = deformable_attention(values, first_row, x.flatten(0, 1), y.flatten(0, 1), weights, [self.grid])
+        return cells + self.dropout(self.output(attended.view(batch, count, -1)))
+
+    def _references(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return row and column ``(H * W)`` around which each cell looks."""
+        rows, columns = self.grid
+        row = torch.arange(rows, device=device)
+        if self.mirrored:  # Released weights have learned to look at the far side of the car.
+            row = row.flip(0)
+        return row.repeat_interleave(columns), torch.arange(columns, device=device).repeat(rows)
+
+
+class ImageCrossAttention(nn.Module):
+    """Deformable attention of the ground cells to the images in which they are seen (spatial cross-attention)."""
+
+    POINTS = PILLAR_SAMPLES
+
+    def __init__(self, config: BevFormerConfig) -> None:
+        super().__init__()
+        width, self.heads = config.width, config.heads
+        samples = self.heads * IMAGE_LEVELS * self.POINTS
+        self.sampling_offsets = Linear(width, 2 * samples)
+        self.attention_weights = Linear(width, samples)
+        self.value = Linear(width, width)
+        self.output = Linear(width, width)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, cells: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor) -> Tensor:
+        """Attend: the mean over the cameras that see a cell and are valid.
+
+        Args:
+            cells: ``(B, H * W, C)``.
+            tokens: ``(B, N, pixels of all levels, C)``.
+            pillars: of the rig.
+            camera_valid: ``(B, N) bool``.
+
+        Returns:
+            ``(B, H * W, C)``, the input included.
+        """
+        valid = camera_valid.to(cells.dtype)
+        cameras = (valid @ pillars.sees.to(cells.dtype).T).clamp(min=1.0)
+        seen = self.look(cells, tokens, pillars) * valid[:, pillars.camera, None]
+        summed = torch.zeros_like(cells).index_add(1, pillars.cell, seen)
+        return cells + self.dropout(self.output(summed / cameras[..., None]))
+
+    def look(self, cells: Tensor, tokens: Tensor, pillars: CameraPillars) -> Tensor:
+        """Return what each cell finds in each camera that sees it: ``(B, P, C)``."""
+        batch, pairs = len(cells), len(pillars.camera)
+        values = self.value(tokens).view(-1, self.heads, cells.shape[-1] // self.heads)
+        weights = self.attention_weights(cells).unflatten(-1, (self.heads, -1)).softmax(dim=-1)
+        weights = weights.unflatten(-1, (IMAGE_LEVELS, self.POINTS))[:, pillars.cell]
+        offsets = self.sampling_offsets(cells).unflatten(-1, (self.heads, IMAGE_LEVELS, self.POINTS, 2))
+        offsets = offsets[:, pillars.cell]
+        # Points take the heights of the pillar in turns: 0, 1, 2, 3, 0, 1, 2, 3.
+        heights = pillars.positions.shape[1]
+        references = pixel_positions(pillars.positions, pillars.level_sizes).transpose(1, 2)
+        references = references.repeat(1, 1, self.POINTS // heights, 1)
+        places = (offsets + references[:, None]).flatten(0, 1)
+        camera_rows = pillars.camera.int() * pillars.tokens
+        first_row = _stream_rows(batch, pairs, tokens.shape[1] * pillars.tokens, cells.device).view(batch, pairs)
+        found = deformable_attention(
+            values,
+            (first_row + camera_rows).flatten(),
+            places[..., 0],
+            places[..., 1],
+            weights.flatten(0, 1),
+            pillars.level_sizes,
+        )
+        return found.view(batch, pairs, -1)
+
+
+class BevEncoderLayer(nn.Module):
+    """Self-attention, image cross-attention, perceptron (each with a norm after the sum), and past maps."""
+
+    def __init__(self, config: BevFormerConfig, past_maps: int, mirrored: bool) -> None:
+        super().__init__()
+        self.self_attention = BevSelfAttention(config, mirrored)
+        self.image_attention = ImageCrossAttention(config)
+        self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(3))
+        self.fusion = TemporalFusion(config.width, past_maps)
+
+    def forward(
+        self, cells: Tensor, code: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor, history: Tensor
+    ) -> Tensor:
+        """Map cells ``(B, H * W, C)`` to ``(B, H * W, C)``; ``history`` is ``(B, S, C, H, W)``."""
+        cells = self.norms[0](self.self_attention(cells, code))
+        cells = self.norms[1](self.image_attention(cells, tokens, pillars, camera_valid))
+        cells = self.norms[2](self.perceptron(cells))
+        bev = _as_map(cells, history.shape[-2:])
+        return flatten_cells(bev + self.fusion(history, bev))
+
+
+class BevFormer(nn.Module):
+    """From image features to the BEV map."""
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        bev = config.bev
+        assert isinstance(bev, BevFormerConfig)
+        width, self.grid = bev.width, (bev.rows, bev.columns)
+        self.where_sum_is_positive = config.quirks.propagate_where_sum_is_positive
+        self.queries = nn.Parameter(torch.randn(bev.rows * bev.columns, width))
+        self.row_code = nn.Parameter(torch.rand(bev.rows, width // 2))
+        self.column_code = nn.Parameter(torch.rand(bev.columns, width // 2))
+        self.level_code = nn.Parameter(torch.randn(LEVEL_CODES, width))
+        self.camera_code = nn.Parameter(torch.randn(len(bev.cameras), width))
+        past_maps, mirrored = len(config.temporal_bev.distances), config.quirks.mirrored_self_attention
+        self.layers = nn.ModuleList(BevEncoderLayer(bev, past_maps, mirrored) for _ in range(bev.layers))
+
+    def forward(
+        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: RigGeometry, state: StreamState
+    ) -> list[Tensor]:
+        """Encode.
+
+        Args:
+            levels: image features ``(B, N, C, h_i, w_i)``, fine to coarse.
+            inputs: which cameras count, and poses.
+            geometry: pillars of the rig.
+            state: of the last frame; its maps take part.
+
+        Returns:
+            A single level ``(B, C, H, W)``, channels-last in memory.
+        """
+        assert isinstance(geometry, CameraPillars), "a rig's pillars come from make_rig_lookup"
+        history = look_back(state, inputs.ego_to_global, self.config)
+        cells = self.first_queries(history.maps, history.valid)
+        code, tokens = self.position_code(), self.image_tokens(levels)
+        for layer in self.layers:
+            cells = layer(cells, code, tokens, geometry, inputs.camera_valid, history.maps)
+        return [_as_map(cells, self.grid)]
+
+    def first_queries(self, history: Tensor, history_valid: Tensor) -> Tensor:
+        """Return the queries ``(B, H * W, C)``: of the nearest past map where it reaches, learned ones elsewhere."""
+        batch, slots = history_valid.shape
+        if slots == 0:
+            return self.queries.expand(batch, -1, -1)
+        past = flatten_cells(history[:, -1])
+        # Released weights take a cell for empty unless its channels add up to more than zero.
+        reached = past.sum(dim=-1) > 0 if self.where_sum_is_positive else (past != 0).any(dim=-1)
+        return torch.where((reached & history_valid[:, -1:])[..., None], past, self.queries)
+
+    def position_code(self) -> Tensor:
+        """Return the code ``(H * W, C)`` of the cells: of the column, then of the row."""
+        rows, columns = self.grid
+        column = self.column_code.expand(rows, -1, -1)
+        row = self.row_code[:, None].expand(-1, columns, -1)
+        return torch.cat([column, row], dim=-1).flatten(0, 1)
+
+    def image_tokens(self, levels: Sequence[Tensor]) -> Tensor:
+        """Return all pixels ``(B, N, pixels of all levels, C)`` with the codes of their camera and level."""
+        tokens = [
+            features.permute(0, 1, 3, 4, 2).flatten(2, 3) + (self.camera_code[:, None] + code)
+            for features, code in zip(levels, self.level_code[: len(levels)], strict=True)
+        ]
+        return torch.cat(tokens, dim=2)
+
+
+def _stream_rows(batch: int, queries: int, rows: int, device: torch.device) -> Tensor:
+    """Return ``(batch * queries) int32``: where the table of each query's stream begins."""
+    return (torch.arange(batch, device=device, dtype=torch.int32) * rows).repeat_interleave(queries)
+
+
+def _as_map(cells: Tensor, grid: Sequence[int]) -> Tensor:
+    """Turn ``(B, H * W, C)`` into ``(B, C, H, W)``, channels-last in memory."""
+    return cells.unflatten(1, tuple(grid)).permute(0, 3, 1, 2)

@@ -1,0 +1,195 @@
+"""MapTracker's decoder: queries of tracks and detections become polylines over six layers."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
+from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
+from predmapnet.network.kernels.deformable_attention import deformable_attention
+from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.layers import ResidualPerceptron
+from predmapnet.network.maptracker.vector_memory import Recalled
+
+
+class LineCrossAttention(nn.Module):
+    """Deformable attention of rows to the BEV map: every head looks around each point of the row's line once."""
+
+    def __init__(self, config: MapTrackerDecoderConfig, grid: tuple[int, int]) -> None:
+        super().__init__()
+        width, self.heads = config.width, config.heads
+        self.grid = grid
+        samples = self.heads * config.points
+        self.sampling_offsets = nn.Linear(width, 2 * samples)
+        self.attention_weights = nn.Linear(width, samples)
+        self.value = Linear(width, width)
+        self.output = nn.Linear(width, width)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, rows: Tensor, points: Tensor, cells: Tensor) -> Tensor:
+        """Attend.
+
+        Args:
+            rows: ``(B, R, C)``.
+            points: ``(B, R, P, 2)``, normalised.
+            cells: ``(B, H * W, C)``.
+
+        Returns:
+            ``(B, R, C)``, the input included.
+        """
+        batch, count, width = rows.shape
+        height, length = self.grid
+        values = self.value(cells).view(-1, self.heads, width // self.heads)
+        offsets = self.sampling_offsets(rows).view(batch * count, self.heads, 1, -1, 2)
+        weights = self.attention_weights(rows).view(batch * count, self.heads, -1).softmax(dim=-1)
+        x = points[..., 0] * length - 0.5
+        y = (1 - points[..., 1]) * height - 0.5
+        stream = torch.arange(batch, device=rows.device, dtype=torch.int32) * (height * length)
+        attended = deformable_attention(
+            values,
+            stream.repeat_interleave(count),
+            offsets[..., 0] + x.view(batch * count, 1, 1, -1),
+            offsets[..., 1] + y.view(batch * count, 1, 1, -1),
+            weights[:, :, None],
+            [self.grid],
+        )
+        return rows + self.dropout(self.output(attended.view(batch, count, width)))
+
+
+class MemoryAttention(nn.Module):
+    """Attention of each track to its own recalled queries."""
+
+    def __init__(self, config: MapTrackerDecoderConfig) -> None:
+        super().__init__()
+        self.attention = _multihead(config)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, tracks: Tensor, memory: Recalled) -> Tensor:
+        """Map tracks ``(B, T, C)`` to ``(B, T, C)``, the input included."""
+        # A padded row has no entries; it attends to zeros instead of to nothing.
+        blocked = ~memory.valid & memory.valid.any(dim=-1, keepdim=True)
+        keys = (memory.queries + memory.code).flatten(0, 1)
+        query, values = tracks.flatten(0, 1)[:, None], memory.queries.flatten(0, 1)
+        attended, _ = self.attention(query, keys, values, key_padding_mask=blocked.flatten(0, 1), need_weights=False)
+        return tracks + self.dropout(attended.view_as(tracks))
+
+
+class RowSelfAttention(nn.Module):
+    """Attention of all rows to each other."""
+
+    def __init__(self, config: MapTrackerDecoderConfig) -> None:
+        super().__init__()
+        self.attention = _multihead(config)
+        self.dropout = nn.Dropout(config.dropout)
+
+    def forward(self, rows: Tensor, valid: Tensor) -> Tensor:
+        """Map rows ``(B, R, C)`` to ``(B, R, C)``, the input included; rows that are not valid are not looked at."""
+        attended, _ = self.attention(rows, rows, rows, key_padding_mask=~valid, need_weights=False)
+        return rows + self.dropout(attended)
+
+
+class MapTrackerDecoderLayer(nn.Module):
+    """Self-attention, BEV attention, memory attention and a perceptron."""
+
+    def __init__(self, config: MapTrackerDecoderConfig, grid: tuple[int, int], norm_before: bool) -> None:
+        super().__init__()
+        self.norm_before = norm_before
+        self.self_attention = RowSelfAttention(config)
+        self.bev_attention = LineCrossAttention(config, grid)
+        self.memory_attention = MemoryAttention(config)
+        self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
+        self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(4))
+
+    def forward(self, rows: Tensor, points: Tensor, start: DecoderRows, cells: Tensor) -> Tensor:
+        """Refine.
+
+        Args:
+            rows: ``(B, T + Q, C)``.
+            points: ``(B, T + Q, P, 2)``, where they are thought to be, normalised.
+            start: validity, memory and age of the streams.
+            cells: ``(B, H * W, C)`` of the BEV map.
+        """
+        rows = self.norms[0](self.self_attention(rows, start.valid))
+        seen = self.bev_attention(rows, points, cells)
+        if self.norm_before:  # Released weights add the norm of the BEV attention's input to its output.
+            recalled = self._with_memory(self.norms[1](rows), start.memory)
+            rows = torch.where(start.first_frame[:, None, None], seen, recalled + seen)
+        else:
+            rows = self._with_memory(self.norms[1](seen), start.memory)
+        return self.norms[3](self.perceptron(self.norms[2](rows)))
+
+    def _with_memory(self, rows: Tensor, memory: Recalled | None) -> Tensor:
+        """Replace the track rows, the first ones, by what their memory makes of them."""
+        assert memory is not None
+        tracks = memory.queries.shape[1]
+        if tracks == 0:
+            return rows
+        return torch.cat([self.memory_attention(rows[:, :tracks], memory), rows[:, tracks:]], dim=1)
+
+
+class MapTrackerDecoder(RowDecoder):
+    """All layers, with one classifier and one polyline branch for all of them."""
+
+    learns_start = True
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        decoder, self.grid = config.decoder, (config.bev.rows, config.bev.columns)
+        assert isinstance(decoder, MapTrackerDecoderConfig)
+        width, norm_before = decoder.width, config.quirks.norm_before_cross_attention
+        self.input = nn.Conv2d(config.bev.widths[0], width, 1)
+        self.layers = nn.ModuleList(
+            MapTrackerDecoderLayer(decoder, self.grid, norm_before) for _ in range(decoder.layers)
+        )
+        self.classify = nn.Linear(width, decoder.classes)
+        self.line = nn.Sequential(
+            nn.Linear(width, 2 * width),
+            nn.LayerNorm(2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, 2 * width),
+            nn.LayerNorm(2 * width),
+            nn.ReLU(),
+            nn.Linear(2 * width, 2 * decoder.points),
+        )
+
+    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Decode, as :class:`RowDecoder` says."""
+        cells = self.bev_cells(bev)
+        rows, points, predictions = start.queries, start.points, []
+        for layer in self.layers:
+            rows = layer(rows, points, start, cells)
+            logits, lines = self.read_out(rows)
+            predictions.append((logits, lines))
+            points = lines.detach()
+        return rows, predictions
+
+    def read_out(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Turn embeddings ``(..., C)`` into logits ``(..., classes)`` and normalised polylines ``(..., P, 2)``."""
+        return self.classify(rows), self.line(rows).sigmoid().unflatten(-1, (-1, 2))
+
+    def bev_cells(self, bev: Tensor) -> Tensor:
+        """Project the map and add a sine code of the position: ``(B, H * W, C)``."""
+        projected = self.input(bev)
+        return (projected + position_code(projected.shape[1], self.grid, projected.device)).flatten(2).transpose(1, 2)
+
+
+def position_code(channels: int, grid: tuple[int, int], device: torch.device) -> Tensor:
+    """Return DETR's sine code ``(C, H, W)`` of the cells: the first half tells the row, the second the column."""
+    (rows, columns), half = grid, channels // 2
+    period = 10000.0 ** (torch.arange(half // 2, device=device, dtype=torch.float32) * 2 / half)
+
+    def along(count: int) -> Tensor:
+        place = torch.arange(1, count + 1, device=device, dtype=torch.float32) / (count + 1e-6) * (2 * math.pi)
+        angles = place[:, None] / period
+        return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1).T
+
+    row = along(rows)[:, :, None].expand(-1, -1, columns)
+    column = along(columns)[:, None].expand(-1, rows, -1)
+    return torch.cat([row, column])
+
+
+def _multihead(config: MapTrackerDecoderConfig) -> nn.MultiheadAttention:
+    return nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)

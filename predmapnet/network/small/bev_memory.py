@@ -1,0 +1,121 @@
+"""Past BEV maps as a residual of finished BEV features (MapTracker's BEV memory, lighter)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from predmapnet.config import PredMapNetConfig, ResidualBevMemoryConfig
+from predmapnet.network.ego_motion import relative_motion, warp_bev
+from predmapnet.network.layers import Pointwise, zero_init
+from predmapnet.network.state import StreamState
+
+
+class TemporalBevFusion(nn.Module):
+    """Past raw maps, chosen by distance and warped, enter the BEV features as residuals that start as zero.
+
+    Raw (unfused) maps are stored, so that nothing is fed back and errors do not accumulate.
+    """
+
+    def __init__(self, config: PredMapNetConfig) -> None:
+        super().__init__()
+        assert isinstance(config.temporal_bev, ResidualBevMemoryConfig)
+        self.config = config.temporal_bev
+        self.roi = config.roi
+        fine, middle, _ = config.bev.widths
+        self.compress = Pointwise(fine, self.config.channels)
+        inputs = len(self.config.distances) * (self.config.channels + 1) + self.config.channels
+        self.mix = Pointwise(inputs, fine)
+        self.fine_residual = nn.Conv2d(fine, fine, 3, padding=1)
+        self.middle_residual = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
+        zero_init(self.fine_residual)
+        zero_init(self.middle_residual)
+
+    def forward(
+        self, fine: Tensor, middle: Tensor, raw: Tensor, ego_to_global: Tensor, state: StreamState
+    ) -> tuple[Tensor, Tensor]:
+        """Fuse the memory of ``state`` into the current features; streams without memory are left as they are.
+
+        Args:
+            fine: ``(B, C_0, H, W)``.
+            middle: ``(B, C_1, H / 2, W / 2)``.
+            raw: ``(B, C_bev, H, W)``, the current map as :attr:`compress` makes it.
+            ego_to_global: ``(B, 4, 4) float64``, current.
+            state: of the last frame.
+        """
+        past, reached = self._look_back(ego_to_global, state)
+        hidden = torch.relu(self.mix(torch.cat([past, reached, raw], dim=1)))
+        known = state.bev_memory_valid.any(dim=1)[:, None, None, None]
+        return (
+            torch.where(known, fine + self.fine_residual(hidden), fine),
+            torch.where(known, middle + self.middle_residual(hidden), middle),
+        )
+
+    def _look_back(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
+        """Return the warped maps ``(B, D * C_bev, H, W)`` and where they reach ``(B, D, H, W)``."""
+        chosen, valid = self._choose(ego_to_global, state)
+        stream = torch.arange(len(chosen), device=chosen.device)[:, None]
+        maps = state.bev_memory[stream, chosen].flatten(0, 1)
+        motion = relative_motion(ego_to_global[:, None], state.bev_memory_pose[stream, chosen]).flatten(0, 1)
+        ones = torch.ones_like(maps[:, :1])
+        warped = warp_bev(torch.cat([maps, ones], dim=1), motion, self.roi) * valid.flatten()[:, None, None, None]
+        warped = warped.unflatten(0, chosen.shape)
+        return warped[:, :, :-1].flatten(1, 2), warped[:, :, -1]
+
+    def _choose(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
+        """For each distance, find the nearest stored map; one that serves two distances is used for the first.
+
+        Returns:
+            ``(B, D) int64`` and ``(B, D) bool``.
+        """
+        travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1).float()
+        wanted = travelled.new_tensor(self.config.distances)
+        error = (travelled[:, None] - wanted[:, None]).abs()
+        error = error.masked_fill(~state.bev_memory_valid[:, None], torch.inf)
+        chosen = error.argmin(dim=-1)
+        repeated = (chosen[:, :, None] == chosen[:, None, :]).tril(diagonal=-1).any(dim=-1)
+        return chosen, ~repeated & state.bev_memory_valid.any(dim=1, keepdim=True)
+
+
+def remember_bev(
+    state: StreamState, raw: Tensor, ego_to_global: Tensor, spacing: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Store the current raw map; the newest one is replaced until the car has moved ``spacing`` metres past it.
+
+    Args:
+        state: of the last frame, with ``K`` slots, newest last.
+        raw: ``(B, C_bev, H, W)``.
+        ego_to_global: ``(B, 4, 4) float64``.
+        spacing: metres between the two newest maps from which on the newest one is kept.
+
+    Returns:
+        The new ``bev_memory``, ``bev_memory_pose`` and ``bev_memory_valid``.
+    """
+    pose, valid, maps = state.bev_memory_pose, state.bev_memory_valid, state.bev_memory
+    if valid.shape[1] == 0:
+        return maps, pose, valid
+    keep_newest = valid[:, -1]
+    if valid.shape[1] > 1:
+        moved = (pose[:, -1, :2, 3] - pose[:, -2, :2, 3]).norm(dim=-1)
+        keep_newest = keep_newest & (~valid[:, -2] | (moved >= spacing))
+    step = keep_newest.long()[:, None]
+    slots = torch.arange(valid.shape[1] - 1, device=valid.device)[None] + step
+    stream = torch.arange(len(valid), device=valid.device)[:, None]
+    return (
+        torch.cat([maps[stream, slots], raw[:, None]], dim=1),
+        torch.cat([pose[stream, slots], ego_to_global[:, None]], dim=1),
+        torch.cat([valid[stream, slots], valid.new_ones(len(valid), 1)], dim=1),
+    )
+
+
+def empty_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return an empty BEV memory: maps, poses and validity.
+
+    The residual fusion has a fixed number of slots, none if it is switched off; the encoder's memory grows.
+    """
+    temporal, slots, channels = config.temporal_bev, 0, config.bev.widths[0]
+    if isinstance(temporal, ResidualBevMemoryConfig):
+        slots, channels = temporal.capacity if temporal.enabled else 0, temporal.channels
+    maps = torch.zeros(batch, slots, channels, config.bev.rows, config.bev.columns, device=device)
+    pose = torch.eye(4, dtype=torch.float64, device=device).expand(batch, slots, 4, 4).clone()
+    return maps, pose, torch.zeros(batch, slots, dtype=torch.bool, device=device)

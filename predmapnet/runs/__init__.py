@@ -1,0 +1,1 @@
+"""The run behind each command, without the command line."""

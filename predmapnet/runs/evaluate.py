@@ -1,0 +1,265 @@
+"""Where the results of a scene come from: mapped now, or read from what an earlier run or another method wrote."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
+from mapfusion.integrate.integrator import MapIntegrator
+from predmapnet.errors import UserError
+from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
+from predmapnet.frame_files.parquet import read_frames, stored_scenes
+from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
+from predmapnet.fusion import NETWORK_ERRORS
+from predmapnet.machine import use_threads
+from predmapnet.scenes import Instant, Progress, Scene, SceneSource
+from predmapnet.sources import open_source
+
+if TYPE_CHECKING:
+    from predmapnet.mapper import Mapper
+
+Submitted = dict[str, SubmittedFrame]
+"""Frames of a submission by name."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is measured; the same for all scenes, and sent to the processes.
+
+    Attributes:
+        dataset, data_root: where frames, poses and ground truth come from.
+        split_scheme, official_frames: see :func:`predmapnet.sources.open_source`.
+        results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
+        weights, device: of the network that maps.
+        roi: region of a submission, which does not say it itself.
+        threads: CPU threads of each process.
+        cache: folder that keeps the ground truth; None computes it anew.
+    """
+
+    dataset: str | None = None
+    data_root: Path | None = None
+    split_scheme: str = "old"
+    official_frames: bool = False
+    results: Path | None = None
+    weights: Path | None = None
+    device: str = "auto"
+    roi: RegionOfInterest = field(default_factory=RegionOfInterest)
+    threads: int = 1
+    cache: Path | None = None
+
+    def open(self) -> tuple[SceneSource, str]:
+        """Open the data set; returns what :func:`predmapnet.sources.open_source` does."""
+        return open_source(self.dataset, self.data_root, self.split_scheme, self.official_frames)
+
+
+def scenes_to_measure(settings: EvaluationSettings, source: SceneSource, split: str | None) -> list[str]:
+    """List the scenes: those of the split, or else those that the results hold, by name.
+
+    Raises:
+        UserError: there is none, the results lack scenes of the split, or hold frames that the data set does not.
+    """
+    wanted = sorted(scene.name for scene in source.scenes(split))
+    if not wanted:
+        raise UserError(f"{source.name} holds no scene{f' of the split {split}' if split else ''}.")
+    if settings.results is None:
+        return wanted
+    held = _scenes_in(settings.results, source, split is None)
+    if split is None:
+        unknown = sorted(held - set(wanted))
+        if unknown:
+            raise UserError(f"{settings.results} holds {unknown[0]}, which is no scene of {source.name}.")
+        return sorted(held)
+    missing = [scene for scene in wanted if scene not in held]
+    if missing:
+        named = ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
+        raise UserError(
+            f"{settings.results} lacks {len(missing)} of {len(wanted)} scenes of the split {split}: {named}"
+        )
+    return wanted
+
+
+def measure_scenes(
+    settings: EvaluationSettings, scenes: Sequence[str], jobs: int = 1, preparing: Progress | None = None
+) -> Iterator[SceneMeasurement]:
+    """Measure scenes one after the other or in several processes; they come in the order of ``scenes``.
+
+    Args:
+        settings: what to measure.
+        scenes: names.
+        jobs: number of processes.
+        preparing: called while a scene is made ready (with one process only).
+
+    Raises:
+        UserError: data or results are broken; the message says which.
+    """
+    submitted = _submitted_of(settings, scenes)
+    if jobs == 1:
+        for scene in scenes:
+            yield _measure(settings, scene, submitted.get(scene), preparing)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(settings.threads,))
+    try:
+        futures = [pool.submit(_measure, settings, scene, submitted.get(scene)) for scene in scenes]
+        for future in futures:
+            yield future.result()
+    except BaseException:
+        workers = list((getattr(pool, "_processes", None) or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.terminate()
+        raise
+    pool.shutdown()
+
+
+def _begin_worker(threads: int) -> None:
+    # Ctrl-C is the parent's business; it ends its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_threads(threads)
+
+
+def _measure(
+    settings: EvaluationSettings, name: str, submitted: Submitted | None, preparing: Progress | None = None
+) -> SceneMeasurement:
+    scene = _source(settings).open(name, preparing)
+    if settings.results is None:
+        from predmapnet.map_scene import map_scene
+
+        run = map_scene(scene, _mapper(settings))
+        frames = _with_truth(scene, run.frame_maps, settings.cache)
+        return measure_scene(frames, run.global_map, scene.truth_map(), run.seconds)
+    if submitted is not None:
+        frame_maps = _submitted_maps(submitted, settings.roi, scene)
+    else:
+        frame_maps = _stored_maps(settings.results, scene)
+    frames = _with_truth(scene, frame_maps, settings.cache)
+    return measure_scene(frames, _integrated(name, frame_maps), scene.truth_map())
+
+
+@lru_cache(maxsize=1)
+def _source(settings: EvaluationSettings) -> SceneSource:
+    return settings.open()[0]
+
+
+@lru_cache(maxsize=1)
+def _mapper(settings: EvaluationSettings) -> Mapper:
+    from predmapnet.mapper import Mapper
+
+    return Mapper.from_checkpoint(settings.weights, device=settings.device)
+
+
+def _submission(path: Path) -> Submitted:
+    return _read_submission(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _read_submission(path: Path, changed: int) -> Submitted:
+    """Read a submission once for as long as it does not change (``changed``: when it was written)."""
+    return read_submission(path)
+
+
+def _submitted_of(settings: EvaluationSettings, scenes: Sequence[str]) -> dict[str, Submitted]:
+    """Frames of a submission by scene: it is read once, each process gets its share. Empty for our own files."""
+    if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
+        return {}
+    submission = _submission(settings.results)
+    of_scene: dict[str, Submitted] = {scene: {} for scene in scenes}
+    for name, scene in _scene_by_name(submission, _source(settings)).items():
+        if scene in of_scene:
+            of_scene[scene][name] = submission[name]
+    return of_scene
+
+
+def _scene_by_name(submission: Submitted, source: SceneSource) -> dict[str, str]:
+    """Scene of each frame of a submission that the data set knows."""
+    positions = {position_name(info.name, index): info.name for info in source.scenes() for index in range(info.frames)}
+    return source.scenes_of(submission) | {name: positions[name] for name in submission if name in positions}
+
+
+def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str]:
+    """Names of the scenes that results hold; ``every_frame``: all frames of a submission must be known."""
+    if results.is_dir():
+        names = {path.stem for path in results.glob("*.parquet")}
+        if not names:
+            raise UserError(
+                f"The folder {results} holds no per-frame results (*.parquet); "
+                "make them with 'predmapnet batch --save-frames'."
+            )
+        return names
+    if results.suffix == ".json":
+        submission = _submission(results)
+        scenes = _scene_by_name(submission, source)
+        unknown = [name for name in submission if name not in scenes]
+        if not scenes or (unknown and every_frame):
+            example = f", {unknown[0]} for one" if unknown else ""
+            hint = " Does it need --official-frames?" if source.name == "argoverse2" else ""
+            raise UserError(
+                f"{results}: {len(unknown)} of {len(submission)} frames are not in {source.name} in {source.root}"
+                f"{example}. Name another data set, or a --split to measure only that.{hint}"
+            )
+        return set(scenes.values())
+    return set(stored_scenes(results))
+
+
+def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
+    """What a submission says of each frame of a scene; a frame that it does not name holds no prediction."""
+    maps = []
+    for index in range(len(scene)):
+        instant = scene.instant(index)
+        names = (instant.token, str(instant.timestamp), position_name(scene.info.name, index))
+        found = next((submitted[name] for name in names if name in submitted), NOTHING)
+        maps.append(found.at(instant, roi))
+    return maps
+
+
+def _stored_maps(results: Path, scene: Scene) -> list[FrameMap]:
+    """What our own files say of each frame of a scene; a frame that they do not name holds no prediction."""
+    name = scene.info.name
+    path = results / f"{name}.parquet" if results.is_dir() else results
+    stored = {frame.index: frame.frame_map for frame in read_frames(path, name).frames}
+    if not stored:
+        raise UserError(f"{path} holds no frame of {name}.")
+    if max(stored) >= len(scene) or min(stored) < 0:
+        raise UserError(f"{path} holds frame {max(stored)} of {name}, which has {len(scene)} frames in the data set.")
+    roi = next(iter(stored.values())).roi
+    return [_at(path, name, index, scene.instant(index), stored.get(index), roi) for index in range(len(scene))]
+
+
+def _at(
+    path: Path, scene: str, index: int, instant: Instant, stored: FrameMap | None, roi: RegionOfInterest
+) -> FrameMap:
+    if stored is None:
+        return NOTHING.at(instant, roi)
+    if not np.allclose(stored.ego_to_global, instant.ego_to_global, atol=1e-3):
+        raise UserError(
+            f"{path}, {scene}, frame {index}: the pose is not the data set's; the results were made from other data."
+        )
+    return stored
+
+
+def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
+    """Fuse what was read as mapping would have; None if nothing is tracked."""
+    if not any((frame_map.track_ids >= 0).any() for frame_map in frame_maps):
+        return None
+    integrator = MapIntegrator(NETWORK_ERRORS)
+    for frame_map in frame_maps:
+        integrator.add(frame_map, log=name)
+    return integrator.map()
+
+
+def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap], cache: Path | None) -> list[EvaluationFrame]:
+    truths = scene.truths(frame_maps[0].roi, cache) if frame_maps else []
+    if truths is None:
+        raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
+    pairs = zip(frame_maps, truths, strict=True)
+    return [EvaluationFrame(scene.info.name, index, found, truth) for index, (found, truth) in enumerate(pairs)]

@@ -1,0 +1,293 @@
+"""The run of one scene: source -> Mapper -> integrator -> files, and a report of what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import torch
+
+import predmapnet
+from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
+from mapfusion.formats.by_suffix import write_map
+from mapfusion.ground import observed_rings
+from predmapnet.demo_world.source import DemoSource
+from predmapnet.errors import UserError
+from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
+from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
+from predmapnet.frame_files.parquet import FrameWriter
+from predmapnet.map_scene import MapSnapshot, Observer, SceneRun, Step, map_scene
+from predmapnet.mapper import Mapper
+from predmapnet.precision import Precision
+from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
+from predmapnet.runs.outputs import Outputs
+from predmapnet.scenes import Progress, Scene, SceneSource
+from predmapnet.sources import open_source
+
+FrameProgress = Callable[[int, int], None]
+"""Called as ``progress(frames done, frames in all)``."""
+
+SEED = 0
+"""Of PyTorch's random numbers; the network draws none while it maps, so this only makes sure of it."""
+
+SYNTHETIC_NOTE = (
+    "This is a map of the synthetic demo world: its roads do not exist, and its coordinates lie where no real road is."
+)
+
+REAL_NOTE = (
+    "The weights were trained on the synthetic demo world alone: on real photographs they show that everything runs, "
+    "not how well PredMapNet maps."
+)
+
+
+UNTRAINED_NOTE = (
+    "Parts of this network have not been trained yet ({parts}): until they are, its maps show that everything runs, "
+    "and nothing else."
+)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How a run compares with the ground truth.
+
+    Attributes:
+        mean_ap: chamfer mAP of the frames at the thresholds of the benchmark.
+        precision, recall: of the global map, length-weighted, at 1.0 m, inside the area that was seen.
+    """
+
+    mean_ap: float
+    precision: float
+    recall: float
+
+
+@dataclass(frozen=True)
+class SceneReport:
+    """What came of a scene, as shown in the table and written to summaries.
+
+    Attributes:
+        scene: its name.
+        elements, metres: per kind, by label.
+        frames: how many were mapped.
+        seconds: wall time of mapping, without preparing.
+        preparing_seconds: opening the scene; the demo world draws its pictures then.
+        frames_per_second: of mapping.
+        milliseconds: mean per frame, by stage.
+        rejections: what the integrator left out, by reason.
+        accuracy: None without ground truth.
+        written: the files.
+    """
+
+    scene: str
+    elements: Mapping[str, int]
+    metres: Mapping[str, float]
+    frames: int
+    seconds: float
+    preparing_seconds: float
+    frames_per_second: float
+    milliseconds: Mapping[str, float]
+    rejections: Mapping[str, int]
+    accuracy: Accuracy | None
+    written: tuple[Path, ...] = field(default=())
+
+
+class MappingPipeline:
+    """Maps scenes of one source with one network.
+
+    Example:
+        >>> pipeline = MappingPipeline.from_settings()  # doctest: +SKIP
+        >>> pipeline.run("scene-0103", Outputs(map=Path("map.geojson"))).elements  # doctest: +SKIP
+        {'ped_crossing': 12, 'divider': 31, 'boundary': 24}
+    """
+
+    def __init__(
+        self, source: SceneSource, mapper: Mapper, sentence: str = "", allow_missing_cameras: bool = False
+    ) -> None:
+        self.source = source
+        self.mapper = mapper
+        self.sentence = sentence
+        self._allow_missing_cameras = allow_missing_cameras
+
+    @classmethod
+    def from_settings(
+        cls,
+        dataset: str | None = None,
+        data_root: Path | None = None,
+        weights: Path | None = None,
+        device: str = "auto",
+        allow_missing_cameras: bool = False,
+        precision: Precision = Precision.FLOAT32,
+        compiled: bool = False,
+    ) -> MappingPipeline:
+        """Choose the source and load the network, as the options of the commands say.
+
+        Raises:
+            UserError: what was asked for is missing or broken.
+        """
+        source, sentence = open_source(dataset, data_root)
+        return cls(
+            source, Mapper.from_checkpoint(weights, device, precision, compiled), sentence, allow_missing_cameras
+        )
+
+    def run(
+        self,
+        scene_name: str,
+        outputs: Outputs,
+        preparing: Progress | None = None,
+        progress: FrameProgress | None = None,
+        viewer: rr.RecordingStream | None = None,
+    ) -> SceneReport:
+        """Map one scene and write what is wanted; each file appears whole or not at all.
+
+        Args:
+            scene_name: as the source calls it.
+            outputs: where to write.
+            preparing: called while the scene is made ready.
+            progress: called after each frame.
+            viewer: a Rerun stream to draw into while mapping.
+
+        Raises:
+            UserError: unknown scene, broken data, or a file that cannot be written.
+        """
+        outputs.check()
+        start = perf_counter()
+        scene = self.source.open(scene_name, preparing)
+        preparing_seconds = perf_counter() - start
+        provenance = self.provenance(scene)
+        torch.manual_seed(SEED)
+        georeference = scene.georeference
+        if georeference is None:
+            where = scene.info.location
+            raise UserError(f"{scene_name} cannot be mapped: nobody knows where on Earth the location '{where}' lies")
+        with ExitStack() as files:
+            observers: list[Observer] = []
+            if viewer is not None:
+                observers.append(SceneRecorder(viewer, describe(provenance), live=True))
+            if outputs.recording is not None:
+                recording = rr.RecordingStream(APPLICATION, recording_id=f"{self.source.name}-{scene_name}")
+                files.enter_context(RecordingFile(recording, outputs.recording))
+                observers.append(SceneRecorder(recording, describe(provenance)))
+            if progress is not None:
+                observers.append(_ProgressObserver(progress))
+            run = map_scene(scene, self.mapper, observers, self._allow_missing_cameras)
+            if outputs.map is not None:
+                seen = seen_area([frame.ego_to_global for frame in run.frames], self.mapper.roi)
+                observed = observed_rings(seen, georeference)
+                write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
+            if outputs.frames is not None:
+                with FrameWriter(outputs.frames, provenance) as writer:
+                    for frame, frame_map in zip(run.frames, run.frame_maps, strict=True):
+                        writer.write(frame.scene, frame.index, frame_map, frame.token)
+        return _report(scene, run, measure(scene, run, self.mapper.roi), preparing_seconds, outputs)
+
+    def provenance(self, scene: Scene) -> dict[str, Any]:
+        """Where the map of a scene comes from, as written into it. Names no path of this machine."""
+        provenance: dict[str, Any] = {
+            "generator": "predmapnet",
+            "version": predmapnet.__version__,
+            "dataset": self.source.name,
+            "scene": scene.info.name,
+            "location": scene.info.location,
+            "synthetic": self.source.synthetic,
+            "configuration": self.mapper.config.model_dump(mode="json"),
+            "weights_sha256": self.mapper.weights_sha256,
+            "precision": self.mapper.precision.value,
+            "compiled": self.mapper.compiled,
+            "seed": SEED,
+        }
+        if self.note:
+            provenance["note"] = self.note
+        return provenance
+
+    @property
+    def note(self) -> str:
+        """What a reader of the map has to know about where it comes from; empty if nothing."""
+        return " ".join([SYNTHETIC_NOTE, self.warning] if self.source.synthetic else [self.warning]).strip()
+
+    @property
+    def warning(self) -> str:
+        """What the user of the command has to know about the weights; empty if nothing."""
+        warnings = []
+        if not self.source.synthetic and self.mapper.facts.get("data") == DemoSource.name:
+            warnings.append(REAL_NOTE)
+        if untrained := self.mapper.facts.get("untrained"):
+            warnings.append(UNTRAINED_NOTE.format(parts=", ".join(untrained)))
+        return " ".join(warnings)
+
+
+class _ProgressObserver:
+    """Counts frames for a progress bar."""
+
+    def __init__(self, progress: FrameProgress) -> None:
+        self._progress = progress
+        self._total = 0
+
+    def begin(self, scene: Scene, roi: RegionOfInterest) -> None:
+        self._total = len(scene)
+        self._progress(0, self._total)
+
+    def observe(self, step: Step, snapshot: MapSnapshot) -> None:
+        self._progress(step.frame.index + 1, self._total)
+
+    def end(self, global_map: GlobalMap) -> None:
+        pass
+
+
+def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | None:
+    """Compare a run with the ground truth of its scene; None where there is none."""
+    truth_map = scene.truth_map()
+    if truth_map is None:
+        return None
+    frames = []
+    for frame, frame_map in zip(run.frames, run.frame_maps, strict=True):
+        truth = scene.truth(frame.index, roi)
+        if truth is not None:
+            frames.append(EvaluationFrame(frame.scene, frame.index, frame_map, truth))
+    seen = seen_area([frame.ego_to_global for frame in run.frames], roi)
+    quality = global_map_quality(run.global_map, truth_map, seen).overall
+    at_one_metre = THRESHOLDS.index(1.0)
+    # An empty map has no precision; it is reported as 0, since nothing in it is right.
+    precision, recall = np.nan_to_num([quality.precision[at_one_metre], quality.recall[at_one_metre]])
+    mean_precision = chamfer_average_precision(frames, thresholds_for(roi)).mean
+    return Accuracy(mean_precision, float(precision), float(recall))
+
+
+def describe(provenance: Mapping[str, Any]) -> str:
+    """Tell in Markdown what a recording shows, for someone who finds the file."""
+    note = f"\n\n**Note.** {provenance['note']}" if "note" in provenance else ""
+    return f"""# {provenance["scene"]} ({provenance["dataset"]}){note}
+
+PredMapNet {provenance["version"]} looks through the cameras at one instant after the other and draws
+pedestrian crossings (blue), lane dividers (orange) and road boundaries (green).
+
+- bright lines: tracks of this instant
+- dashes: what was forecast for this instant one frame ago
+- dark lines: the global map as it grows
+- grey: ground truth, where the data set has it
+
+Weights {provenance["weights_sha256"][:12]}
+"""
+
+
+def _report(
+    scene: Scene, run: SceneRun, accuracy: Accuracy | None, preparing_seconds: float, outputs: Outputs
+) -> SceneReport:
+    return SceneReport(
+        scene=scene.info.name,
+        elements={kind.label: len(run.global_map.of_kind(kind)) for kind in ElementKind},
+        metres={kind.label: run.global_map.length(kind) for kind in ElementKind},
+        frames=len(run.frames),
+        seconds=run.seconds,
+        preparing_seconds=preparing_seconds,
+        frames_per_second=run.frames_per_second,
+        milliseconds=run.milliseconds,
+        rejections=run.rejections,
+        accuracy=accuracy,
+        written=outputs.paths,
+    )

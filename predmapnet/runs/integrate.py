@@ -1,0 +1,251 @@
+"""Anybody's per-frame results into one map: our Parquet, submissions of MapTracker and kin, results of MapTR."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import shapely
+from numpy.typing import NDArray
+
+from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
+from mapfusion.visibility import frame_ground
+from predmapnet.errors import UserError
+from predmapnet.frame_files.parquet import read_frames, refuse_pickle
+from predmapnet.frame_files.pose_file import FramePose, read_poses
+from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
+from predmapnet.fusion import NETWORK_ERRORS
+
+Float = NDArray[np.float64]
+
+NAMED = 3
+"""So many tokens are named where many do not match."""
+
+
+@dataclass(frozen=True)
+class LoggedFrame:
+    """What was seen at one instant of one drive."""
+
+    log: str
+    frame_map: FrameMap
+
+
+@dataclass(frozen=True)
+class Integration:
+    """The map that came of frames, and what was left out.
+
+    Attributes:
+        map: metric global frame.
+        frames: how many were fused.
+        logs: names of the drives.
+        rejections: what the integrator left out, by reason.
+        notes: what the user should know.
+        observed: ground that the frames looked at, metres.
+        location: of the data set, if the frames say it.
+        synthetic: whether the frames say that the place is made up.
+    """
+
+    map: GlobalMap
+    frames: int
+    logs: tuple[str, ...]
+    rejections: Mapping[str, int]
+    observed: shapely.Geometry
+    notes: tuple[str, ...] = ()
+    location: str = ""
+    synthetic: bool = False
+
+
+def integrate_file(
+    frames: Path,
+    poses: Path | None = None,
+    roi: RegionOfInterest | None = None,
+    min_score: float = 0.4,
+    y_forward: bool = False,
+) -> Integration:
+    """Read per-frame results and fuse them.
+
+    Args:
+        frames: Parquet of ours (poses included), or JSON in the layout of MapTracker or MapTR.
+        poses: for JSON; see :func:`predmapnet.frame_files.pose_file.read_poses`.
+        roi: region that the detector looked at, for JSON; 60 m x 30 m without.
+        min_score: elements below are left out where the file has no track ids, since nothing has picked them.
+        y_forward: the file's x points right and its y forward, as MapTR's on nuScenes.
+
+    Raises:
+        UserError: a file that cannot be read, tokens without poses, points that cannot be metres of the ego frame.
+    """
+    notes: list[str] = []
+    provenance: Mapping[str, Any] = {}
+    if frames.suffix.lower() == ".parquet":
+        if poses is not None:
+            raise UserError(f"{frames} holds its poses itself; leave out --poses.")
+        stored = read_frames(frames)
+        logged = [LoggedFrame(frame.scene, frame.frame_map) for frame in stored.frames]
+        provenance = stored.provenance
+    else:
+        if poses is None:
+            raise UserError(f"{frames} holds no poses: give them with --poses poses.json or --poses poses.csv.")
+        submitted = _read_json(frames)
+        known = read_poses(poses)
+        if y_forward:
+            submitted = {token: _turned(frame) for token, frame in submitted.items()}
+        logged = _placed(frames, poses, submitted, known, roi or RegionOfInterest(), min_score, notes)
+    location, synthetic = str(provenance.get("location", "")), bool(provenance.get("synthetic"))
+    return replace(integrate(logged), notes=tuple(notes), location=location, synthetic=synthetic)
+
+
+def integrate(frames: Iterable[LoggedFrame]) -> Integration:
+    """Fuse frames, in the order of their times.
+
+    Raises:
+        UserError: there is no frame, or none that can be used.
+    """
+    ordered = sorted(frames, key=lambda frame: (frame.log, frame.frame_map.timestamp))
+    if not ordered:
+        raise UserError("there is no frame to integrate")
+    integrator = MapIntegrator(NETWORK_ERRORS)
+    grounds = []
+    for frame in ordered:
+        before = integrator.frames
+        integrator.add(frame.frame_map, frame.log)
+        if integrator.frames > before:
+            grounds.append(frame_ground(frame.frame_map))
+    logs = tuple(dict.fromkeys(frame.log for frame in ordered))
+    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), shapely.union_all(grounds))
+
+
+def _read_json(path: Path) -> dict[str, SubmittedFrame]:
+    """Read a submission, or results of MapTR, which name their classes."""
+    if not path.is_file():
+        raise UserError(f"There is no file {path}.")
+    refuse_pickle(path)
+    try:
+        content = orjson.loads(path.read_bytes())
+    except orjson.JSONDecodeError:
+        return read_submission(path)  # says what is wrong
+    results = content.get("results") if isinstance(content, dict) else None
+    if isinstance(results, list) and results and isinstance(results[0], dict) and "sample_token" in results[0]:
+        return {str(entry.get("sample_token")): _maptr_frame(path, entry) for entry in results}
+    return read_submission(path)
+
+
+def _maptr_frame(path: Path, entry: Mapping[str, Any]) -> SubmittedFrame:
+    where = f"{path}, frame {entry.get('sample_token')}"
+    try:
+        vectors = entry["vectors"]
+        kinds = np.array([ElementKind[str(v["cls_name"]).upper()] for v in vectors], dtype=np.int64)
+        scores = np.array([v["confidence_level"] for v in vectors], dtype=np.float64)
+        points = tuple(np.array(v["pts"], dtype=np.float64)[:, :2] for v in vectors)
+    except KeyError as error:
+        raise UserError(
+            f"{where}: {error} is missing or unknown; pts, cls_name (ped_crossing, divider or boundary) and "
+            "confidence_level are expected in each vector."
+        ) from error
+    except (TypeError, ValueError, IndexError) as error:
+        raise UserError(f"{where}: the points or scores are not numbers as expected: {error}.") from error
+    rings = (
+        np.vstack([line, line[:1]])
+        if kind == ElementKind.PED_CROSSING and not np.array_equal(line[0], line[-1])
+        else line
+        for kind, line in zip(kinds, points, strict=True)
+    )
+    return SubmittedFrame(kinds, scores, np.full(len(kinds), -1), tuple(rings))
+
+
+def _turned(frame: SubmittedFrame) -> SubmittedFrame:
+    """From x right, y forward to x forward, y left."""
+    visible = None if frame.visible is None else tuple(map(_turned_line, frame.visible))
+    return replace(frame, polylines=tuple(map(_turned_line, frame.polylines)), visible=visible)
+
+
+def _turned_line(line: Float) -> Float:
+    return np.column_stack([line[:, 1], -line[:, 0]])
+
+
+def _placed(
+    frames_path: Path,
+    poses_path: Path,
+    submitted: Mapping[str, SubmittedFrame],
+    poses: Mapping[str, FramePose],
+    roi: RegionOfInterest,
+    min_score: float,
+    notes: list[str],
+) -> list[LoggedFrame]:
+    """Put each frame where its pose says; a pose without a frame is an instant at which nothing was seen."""
+    found = _by_name(submitted, poses)
+    lost = [token for token in submitted if token not in found]
+    if lost:
+        some = ", ".join(lost[:NAMED]) + (" ..." if len(lost) > NAMED else "")
+        raise UserError(
+            f"{len(lost)} of {len(submitted)} frames of {frames_path} have no pose in {poses_path}: {some}. "
+            f"Its tokens look like {', '.join(list(poses)[:NAMED])}."
+        )
+    _check_region(frames_path, submitted.values(), roi)
+    seen = {pose.token: frame for token, frame in submitted.items() for pose in (found[token],)}
+    empty = len(poses) - len(seen)
+    if empty:
+        notes.append(
+            f"{empty} poses have no frame in {frames_path.name}: there the detector is taken to have seen nothing"
+        )
+    tracked = any((frame.track_ids >= 0).any() for frame in submitted.values())
+    if not tracked:
+        notes.append(
+            f"{frames_path.name} has no track ids: elements with a score of at least {min_score:g} are used, "
+            "and put together by where they lie"
+        )
+    next_track = 0
+    logged = []
+    for pose in poses.values():
+        frame = seen.get(pose.token, NOTHING)
+        if not tracked:
+            count = len(frame.kinds)
+            ids = np.where(frame.scores >= min_score, next_track + np.arange(count), -1)
+            frame = replace(frame, track_ids=ids)
+            next_track += count
+        frame_map = FrameMap(
+            pose.timestamp,
+            pose.ego_to_global,
+            roi,
+            frame.kinds,
+            frame.scores,
+            frame.track_ids,
+            frame.polylines,
+            visible=frame.visible,
+        )
+        logged.append(LoggedFrame(pose.scene, frame_map))
+    return logged
+
+
+def _by_name(submitted: Mapping[str, SubmittedFrame], poses: Mapping[str, FramePose]) -> dict[str, FramePose]:
+    """Find poses by token, or by scene and place in it where the frames are named so."""
+    if any(token in poses for token in submitted):
+        return {token: poses[token] for token in submitted if token in poses}
+    scenes: dict[str, list[FramePose]] = {}
+    for pose in sorted(poses.values(), key=lambda pose: pose.timestamp):
+        scenes.setdefault(pose.scene, []).append(pose)
+    places = {position_name(scene, i): pose for scene, own in scenes.items() for i, pose in enumerate(own)}
+    return {token: places[token] for token in submitted if token in places}
+
+
+def _check_region(path: Path, frames: Iterable[SubmittedFrame], roi: RegionOfInterest) -> None:
+    lines = [line for frame in frames for line in frame.polylines if np.isfinite(line).all()]
+    if not lines:
+        return
+    points = np.concatenate(lines)
+    half = roi.size / 2 + 1.0
+    outside = float((np.abs(points) > half).any(axis=1).mean())
+    if outside > 0.25:
+        turned = float((np.abs(points[:, ::-1]) > half).any(axis=1).mean())
+        hint = (
+            "They fit with x to the right and y forward: add --y-forward."
+            if turned < 0.05
+            else "Metres of the ego frame, x forward, are expected; --roi LENGTHxWIDTH says how far the detector looks."
+        )
+        raise UserError(
+            f"{path}: {100 * outside:.0f} % of the points lie outside the region of {roi.length:g} m x "
+            f"{roi.width:g} m. {hint}"
+        )

@@ -1,0 +1,123 @@
+"""Which data set a command works on: what was asked for, or the demo world when nothing is configured.
+
+Environment variables, each used only where the command line says nothing:
+
+* ``PREDMAPNET_DATASET``: ``nuscenes``, ``argoverse2`` or ``demo``.
+* ``PREDMAPNET_DATA_ROOT``: folder of the data set.
+* ``NUSCENES_ROOT``, ``AV2_ROOT``: the customary names of the field, looked at last.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.argoverse2_files import find_logs
+from predmapnet.datasets.nuscenes import NuScenesSource, find_versions
+from predmapnet.datasets.splits import check_scheme
+from predmapnet.demo_world.source import DemoSource
+from predmapnet.errors import UserError
+from predmapnet.scenes import SceneSource
+
+DATASETS = ("nuscenes", "argoverse2", "demo")
+ROOT_VARIABLES = {"nuscenes": "NUSCENES_ROOT", "argoverse2": "AV2_ROOT"}
+
+
+def open_source(
+    dataset: str | None = None,
+    data_root: Path | None = None,
+    split_scheme: str = "old",
+    official_frames: bool = False,
+) -> tuple[SceneSource, str]:
+    """Open the data set that was asked for.
+
+    Args:
+        dataset: ``nuscenes``, ``argoverse2`` or ``demo``; None asks the environment, then the folder itself.
+        data_root: folder of the data set (for the demo world: its cache); None asks the environment.
+        split_scheme: ``old`` (the data set's own splits) or ``new`` (StreamMapNet's geographically disjoint ones).
+        official_frames: of Argoverse 2, take exactly the frames of the published benchmarks instead of counting the
+            sweeps of each log from 0. nuScenes has only one kind of frames.
+
+    Returns:
+        The source, and one plain sentence that says which data set it is and why.
+
+    Raises:
+        UserError: what was asked for is missing or broken; there is no silent fallback.
+    """
+    check_scheme(split_scheme)
+    source, sentence = _open(dataset, data_root, split_scheme, official_frames)
+    if isinstance(source, DemoSource) and split_scheme == "new":
+        raise UserError("The demo world has no new split: each of its scenes has a town of its own anyway.")
+    if official_frames and not isinstance(source, Argoverse2Source):
+        raise UserError(f"Official frames are a matter of Argoverse 2; {source.name} has only one kind of frames.")
+    if split_scheme == "new":
+        sentence += " Splits are the new, geographically disjoint ones."
+    return source, sentence
+
+
+def _open(
+    dataset: str | None, data_root: Path | None, split_scheme: str, official_frames: bool
+) -> tuple[SceneSource, str]:
+    dataset, dataset_from = _setting(dataset, "--dataset", "PREDMAPNET_DATASET")
+    root_text, root_from = _setting(data_root, "--data-root", "PREDMAPNET_DATA_ROOT")
+    if dataset is not None and dataset not in DATASETS:
+        raise UserError(f"{dataset_from} says '{dataset}', but the data sets are: {', '.join(DATASETS)}.")
+    if dataset == "demo":
+        source = DemoSource(None if root_text is None else Path(root_text).expanduser())
+        return source, f"Using the demo world (synthetic towns), as {dataset_from} says."
+    if root_text is None:
+        dataset, dataset_from, root_text, root_from = _customary_root(dataset, dataset_from)
+    if root_text is None:
+        if dataset is not None:
+            raise UserError(
+                f"{dataset_from} asks for {dataset}, but nothing says where it lies: give --data-root, or set "
+                f"PREDMAPNET_DATA_ROOT or {ROOT_VARIABLES[dataset]}."
+            )
+        return DemoSource(), "Using the demo world (synthetic towns), because no data set is configured."
+    root = Path(root_text).expanduser()
+    if not root.exists():
+        raise UserError(f"{root_from} says the data lie in {root}, but that folder does not exist.")
+    kind = dataset or _guess(root, root_from)
+    opened: SceneSource
+    if kind == "nuscenes":
+        opened = NuScenesSource(root, split_scheme=split_scheme)
+    else:
+        opened = Argoverse2Source(root, split_scheme=split_scheme, official_frames=official_frames)
+    why = f"as {dataset_from} and {root_from} say" if dataset else f"recognised in the folder that {root_from} names"
+    version = f" {opened.version}" if isinstance(opened, NuScenesSource) else ""
+    return opened, f"Using {kind}{version} in {root}, {why}."
+
+
+def _setting(argument: object, option: str, variable: str) -> tuple[str | None, str]:
+    """What the command line says, else the environment; and which of them it was."""
+    if argument is not None:
+        return str(argument), option
+    return os.environ.get(variable) or None, variable
+
+
+def _customary_root(dataset: str | None, dataset_from: str) -> tuple[str | None, str, str | None, str]:
+    set_variables = {
+        kind: variable
+        for kind, variable in ROOT_VARIABLES.items()
+        if os.environ.get(variable) and dataset in (None, kind)
+    }
+    if len(set_variables) > 1:
+        raise UserError(
+            f"Both {' and '.join(set_variables.values())} are set: choose with --dataset nuscenes or argoverse2."
+        )
+    for kind, variable in set_variables.items():
+        return kind, dataset_from if dataset else variable, os.environ[variable], variable
+    return dataset, dataset_from, None, ""
+
+
+def _guess(root: Path, root_from: str) -> str:
+    """Recognise the data set by what lies in its folder."""
+    if find_versions(root):
+        return "nuscenes"
+    if find_logs(root):
+        return "argoverse2"
+    raise UserError(
+        f"{root_from} says the data lie in {root}, but that is neither nuScenes (no v1.0-*/scene.json) nor Argoverse 2 "
+        "(no log folders with city_SE3_egovehicle.feather, directly or in train, val or test)."
+    )

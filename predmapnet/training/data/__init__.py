@@ -1,0 +1,1 @@
+"""Frames, truth and augmentation for training."""

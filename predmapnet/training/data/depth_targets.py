@@ -1,0 +1,63 @@
+"""What the auxiliary depth head should say: the lidar's points as each camera sees them, in bins (MapTRv2, Sec. 3.4).
+
+As in BEVDepth (Li et al. 2023), the nearest point of a feature cell counts, and cells without a point say nothing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from predmapnet.config import DepthConfig
+from predmapnet.scenes import Camera, Rig
+
+Float = NDArray[np.float64]
+
+UNKNOWN = -1
+"""Target of a cell without a point."""
+
+
+def depth_targets(points: Float, cameras: Rig, stride: int, config: DepthConfig) -> NDArray[np.int64]:
+    """Project a sweep into all cameras.
+
+    Args:
+        points: ``(n, 3)``, metres, ego frame.
+        cameras: as the network sees them: their size and intrinsics are those of its input.
+        stride: pixels of the input per cell of the features.
+        config: the bins.
+
+    Returns:
+        ``(N, ceil(h / stride), ceil(w / stride)) int64``: bin of each cell, or :data:`UNKNOWN`.
+    """
+    return np.stack([_of_camera(points, camera, stride, config) for camera in cameras])
+
+
+def _of_camera(points: Float, camera: Camera, stride: int, config: DepthConfig) -> NDArray[np.int64]:
+    rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
+    seen = (points - position) @ rotation
+    depth = seen[:, 2]
+    within = (depth >= config.near) & (depth < config.far)
+    seen, depth = seen[within], depth[within]
+    pixels = (seen @ camera.intrinsics.T)[:, :2] / depth[:, None]
+    inside = (pixels >= 0).all(axis=1) & (pixels < [camera.width, camera.height]).all(axis=1)
+    cells, depth = (pixels[inside] // stride).astype(np.int64), depth[inside]
+    far_to_near = np.argsort(-depth, kind="stable")
+    bins = ((depth - config.near) / (config.far - config.near) * config.bins).astype(np.int64)
+    targets = np.full((-(-camera.height // stride), -(-camera.width // stride)), UNKNOWN)
+    targets[cells[far_to_near, 1], cells[far_to_near, 0]] = bins[far_to_near]
+    return targets
+
+
+def depth_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """Binary cross-entropy of all bins' probabilities (a softmax), summed over bins, mean over the known cells.
+
+    Args:
+        logits: ``(..., D, h', w')``.
+        targets: ``(..., h', w') int64``, as of :func:`depth_targets`.
+    """
+    known = targets != UNKNOWN
+    wanted = functional.one_hot(targets.clamp(min=0), logits.shape[-3]).to(logits.dtype)
+    entropy = functional.binary_cross_entropy(logits.movedim(-3, -1).softmax(dim=-1), wanted, reduction="none")
+    return (entropy.sum(dim=-1) * known).sum() / known.sum().clamp(min=1)
