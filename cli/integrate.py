@@ -9,7 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from mapfusion.elements import RegionOfInterest
-    from mapfusion.formats.geojson import Georeference
+    from mapfusion.georeference import Georeference
 
 
 def integrate(

@@ -1,9 +1,9 @@
 """Vector maps and their integration: tracked polylines and poses in, one global map out. No torch."""
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
+from mapfusion.ground import CameraSector, visible_ground
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
-from mapfusion.visibility import CameraSector, visible_ground
 
 __all__ = [
     "CameraSector",

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.geojson import DECIMALS, Georeference, InvertibleGeoreference, write_whole
+from mapfusion.files import write_whole
+from mapfusion.formats.geojson import DECIMALS
 from mapfusion.geometry import arc_length
+from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
 

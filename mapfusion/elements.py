@@ -81,7 +81,7 @@ class FrameMap:
         history_masks: ``(n, rows, columns) float32``, raster memory of each element, same grid convention.
         visible: rings ``(k, 2) float64``, metres, ego frame, around the ground that could be seen at that instant; a
             ring within another is a hole. Nothing seen where nothing can be seen is no evidence (see
-            :func:`mapfusion.visibility.visible_ground`). ``None``: all of the ROI.
+            :func:`mapfusion.ground.visible_ground`). ``None``: all of the ROI.
     """
 
     timestamp: int

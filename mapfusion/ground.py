@@ -1,30 +1,155 @@
-"""Which ground a map speaks of: where nothing in the map means that nothing was there."""
+"""Ground as polygons: what a car could see at one instant, what a drive looked at, and what a map speaks of.
+
+A detector that reports nothing at a place has either looked and found nothing, or could not look. Only the first is
+evidence against what the map holds there. ``FrameMap.visible`` tells the difference: outlines of the visible ground,
+made by :func:`visible_ground` from cameras and obstacles, or by anything else (free space of a lidar, a range image).
+Where it is None, the whole region counts as looked at.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from mapfusion.elements import GlobalMap, MapElement
-from mapfusion.formats.geojson import Georeference, InvertibleGeoreference
+from mapfusion.elements import FrameMap, GlobalMap, MapElement, RegionOfInterest
+from mapfusion.geometry import transform_points
+from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 Float = NDArray[np.float64]
+
+SECTOR_STEP = np.radians(5.0)
+"""Angle between the vertices of an arc, radians."""
 
 NEAR = 8.0
 """Ground within this distance of an element that was found counts as looked at, metres."""
 
 RIM = 2.0
-"""This close to the edge of what was seen, nothing found means nothing, metres."""
+"""Width of the rim of the seen ground in which a missing element means nothing, metres."""
 
 SMALLEST_HOLE = 20.0
-"""Smaller patches that a drive did not see are not told, square metres."""
+"""Holes in the seen ground smaller than this are not written, square metres."""
 
 CLOSING = 8.0
-"""Gaps narrower than twice this between such grounds count, too: the middle of a wide road, metres."""
+"""Gaps narrower than twice this between stretches of looked-at ground count as looked at: the middle of a wide road,
+metres."""
+
+
+@dataclass(frozen=True)
+class CameraSector:
+    """Horizontal sector that a camera looks at, without a far end.
+
+    Attributes:
+        position: ``(2,) float64``, metres, ego frame.
+        heading: of the optical axis, radians from x (forward) towards y (left).
+        field_of_view: horizontal, radians, at most a full turn.
+    """
+
+    position: Float
+    heading: float = 0.0
+    field_of_view: float = 2 * np.pi
+
+    def ground(self, reach: float) -> shapely.Polygon:
+        """Return the sector up to a distance, metres."""
+        if self.field_of_view >= 2 * np.pi:
+            return shapely.Point(self.position).buffer(reach)
+        steps = max(int(np.ceil(self.field_of_view / SECTOR_STEP)), 2)
+        angle = self.heading + self.field_of_view * np.linspace(-0.5, 0.5, steps + 1)
+        arc = self.position + reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return shapely.Polygon(np.vstack([self.position, arc]))
+
+
+def shadow(eye: Float, obstacle: Float, reach: float) -> shapely.Polygon:
+    """Return the ground that a convex obstacle hides, its own footprint included.
+
+    Args:
+        eye: ``(2,)``, position of the camera, metres.
+        obstacle: ``(n, 2)``, outline on the ground, metres; taller than the camera is high.
+        reach: length of the shadow, metres.
+    """
+    away = obstacle - eye
+    far = eye + away * (reach / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6))
+    return shapely.MultiPoint(np.vstack([obstacle, far])).convex_hull
+
+
+def visible_ground(
+    roi: RegionOfInterest, cameras: Sequence[CameraSector], obstacles: Sequence[Float] = ()
+) -> tuple[Float, ...]:
+    """Return the ground that at least one camera sees, for ``FrameMap.visible``.
+
+    Args:
+        roi: the region that the detector reports on.
+        cameras: of the car.
+        obstacles: convex outlines ``(n, 2)``, metres, ego frame, of what is taller than the cameras are high: trucks,
+            buses, walls. Lower ones hide little ground.
+
+    Returns:
+        Rings ``(n, 2)``, metres, ego frame; a ring within another is a hole.
+
+    Example:
+        >>> truck = np.array([[5.0, 2.0], [13.0, 2.0], [13.0, 4.5], [5.0, 4.5]])
+        >>> rings = visible_ground(RegionOfInterest(), [CameraSector(np.zeros(2))], [truck])
+        >>> bool(shapely.contains_xy(ground_within(rings), 15.0, 8.0)), bool(
+        ...     shapely.contains_xy(ground_within(rings), 15.0, -8.0)
+        ... )
+        (False, True)
+    """
+    reach = 2.0 * float(np.hypot(*roi.size))
+    seen = []
+    for camera in cameras:
+        shadows = [shadow(camera.position, outline, 2.0 * reach) for outline in obstacles]
+        seen.append(shapely.difference(camera.ground(reach), shapely.union_all(shadows)))
+    return tuple(rings_around(shapely.intersection(shapely.union_all(seen), region(roi))))
+
+
+def region(roi: RegionOfInterest) -> shapely.Polygon:
+    """Return the rectangle of a region of interest, ego frame."""
+    return shapely.box(*(-roi.size / 2), *(roi.size / 2))
+
+
+def ground_problem(frame_map: FrameMap) -> str | None:
+    """Return the fault of the visible ground that a frame states, or None."""
+    for ring in frame_map.visible or ():
+        if np.ndim(ring) != 2 or np.shape(ring)[1] != 2 or len(ring) < 3 or not np.isfinite(ring).all():
+            return "visible ground is no polygon"
+    return None
+
+
+def frame_ground(frame_map: FrameMap) -> shapely.Geometry:
+    """Return the ground that was looked at in a frame, global frame, metres."""
+    return _placed(_ego_ground(frame_map), frame_map)
+
+
+def seen_along(frame_maps: Iterable[FrameMap]) -> shapely.Geometry:
+    """Return the ground that was looked at on a drive: the union of :func:`frame_ground`, global frame, metres.
+
+    Frames that share one ``visible`` (one rig, all cameras there) share its outline, which makes 10,000 of them a
+    matter of seconds.
+    """
+    grounds: list[shapely.Geometry] = []
+    last: FrameMap | None = None
+    ego_ground = shapely.Polygon()
+    for frame_map in frame_maps:
+        if last is None or frame_map.visible is not last.visible or frame_map.roi != last.roi:
+            ego_ground = _ego_ground(frame_map)
+        last = frame_map
+        grounds.append(_placed(ego_ground, frame_map))
+    return shapely.union_all(grounds)
+
+
+def _ego_ground(frame_map: FrameMap) -> shapely.Geometry:
+    ground = region(frame_map.roi)
+    if frame_map.visible is None:
+        return ground
+    return shapely.intersection(ground, ground_within(frame_map.visible))
+
+
+def _placed(ego_ground: shapely.Geometry, frame_map: FrameMap) -> shapely.Geometry:
+    return shapely.transform(ego_ground, lambda points: transform_points(frame_map.ego_to_global, points))
 
 
 def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None) -> shapely.Geometry:

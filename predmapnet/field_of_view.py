@@ -9,8 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import RegionOfInterest
-from mapfusion.ground import ground_within, rings_around
-from mapfusion.visibility import CameraSector, region, visible_ground
+from mapfusion.ground import CameraSector, ground_within, region, rings_around, visible_ground
 from predmapnet.scenes import Camera, Frame
 
 Float = NDArray[np.float64]

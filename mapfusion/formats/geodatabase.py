@@ -17,14 +17,9 @@ import shapely
 import shapely.geometry
 
 from mapfusion.elements import GlobalMap
-from mapfusion.formats.geojson import (
-    Georeference,
-    InvertibleGeoreference,
-    elements_of,
-    feature_of,
-    origin_of,
-    write_whole,
-)
+from mapfusion.files import write_whole
+from mapfusion.formats.geojson import elements_of, feature_of, origin_of
+from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 LINES, CROSSINGS = "lines", "crossings"
 LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")

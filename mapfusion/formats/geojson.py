@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import secrets
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
+from mapfusion.files import write_whole
 from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 Float = NDArray[np.float64]
 
@@ -27,27 +27,6 @@ DECIMALS = 10
 """Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-class Georeference(Protocol):
-    """From the metric global frame to WGS84."""
-
-    @property
-    def name(self) -> str:
-        """Of the frame, for the file's metadata."""
-        ...
-
-    def to_wgs84(self, points: Float) -> Float:
-        """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
-        ...
-
-
-class InvertibleGeoreference(Georeference, Protocol):
-    """A georeference that also leads back."""
-
-    def from_wgs84(self, points: Float) -> Float:
-        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""
-        ...
 
 
 def write_geojson(
@@ -258,16 +237,3 @@ def element_of(feature: Mapping[str, Any], georeference: InvertibleGeoreference)
 def _positions(feature: Mapping[str, Any]) -> Float:
     geometry = feature["geometry"]
     return np.array(geometry["coordinates"][0] if geometry["type"] == "Polygon" else geometry["coordinates"])
-
-
-@contextmanager
-def write_whole(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` that becomes the file if the block succeeds, and vanishes if not."""
-    temporary = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
-    try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -19,14 +19,9 @@ import numpy as np
 import shapely
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.geojson import (
-    Georeference,
-    InvertibleGeoreference,
-    elements_of,
-    feature_of,
-    origin_of,
-    write_whole,
-)
+from mapfusion.files import write_whole
+from mapfusion.formats.geojson import elements_of, feature_of, origin_of
+from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 TYPES = {
     ElementKind.PED_CROSSING: "pedestrian_marking",

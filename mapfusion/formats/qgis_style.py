@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mapfusion.elements import ElementKind
-from mapfusion.formats.geojson import write_whole
+from mapfusion.files import write_whole
 
 COLOURS = {
     ElementKind.PED_CROSSING: (86, 180, 233),

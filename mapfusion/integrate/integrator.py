@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
+from mapfusion.ground import ground_problem
 from mapfusion.integrate.assembly import Assembly
 from mapfusion.integrate.association import Candidate, assign, candidates, gather
 from mapfusion.integrate.config import IntegratorConfig
@@ -34,7 +35,6 @@ from mapfusion.integrate.state import load_state, save_state
 from mapfusion.integrate.tile_index import TileIndex
 from mapfusion.integrate.uncertainty import PRIOR_SHARES, PROBE_SPACING, ErrorModel
 from mapfusion.integrate.views import ViewGrid, clearly_visible
-from mapfusion.visibility import ground_problem
 
 Float = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind
-from mapfusion.formats.geojson import write_whole
+from mapfusion.files import write_whole
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.curve import Curve
 from mapfusion.integrate.frame_log import LogBook

@@ -19,8 +19,8 @@ from scipy.special import expit
 from mapfusion.alignment import Alignment, Landmarks, align, landmarks
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
-from mapfusion.formats.geojson import InvertibleGeoreference
 from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, ground_within, rings_around
 from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.lines import Contribution, Looks, MergeConfig, fuse_lines

@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
-from mapfusion.visibility import frame_ground
+from mapfusion.ground import frame_ground
 from predmapnet.errors import UserError
 from predmapnet.frame_files.parquet import read_frames, refuse_pickle
 from predmapnet.frame_files.pose_file import FramePose, read_poses

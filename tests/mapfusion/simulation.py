@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
-from mapfusion.ground import ground_within
-from mapfusion.visibility import CameraSector, visible_ground
+from mapfusion.ground import CameraSector, ground_within, visible_ground
 
 Float = NDArray[np.float64]
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, IntegratorConfig, MapElement, MapIntegrator, RegionOfInterest
+from mapfusion.ground import CameraSector, visible_ground
 from mapfusion.integrate.joining import join
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.tidying import hairpins
-from mapfusion.visibility import CameraSector, visible_ground
 from tests.mapfusion.map_quality import dense, faults, nearest
 from tests.mapfusion.simulation import ROI, pose, town_drive
 from tests.mapfusion.test_integrator_properties import frame_map, integrate

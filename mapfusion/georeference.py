@@ -1,0 +1,31 @@
+"""Protocols of a georeference: how a metric frame leads to WGS84 and back."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+class Georeference(Protocol):
+    """The way from a metric global frame to WGS84; used where maps are written."""
+
+    @property
+    def name(self) -> str:
+        """Name of the metric frame, for a file's metadata."""
+        ...
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        ...
+
+
+class InvertibleGeoreference(Georeference, Protocol):
+    """A georeference that also leads back."""
+
+    def from_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""
+        ...
