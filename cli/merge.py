@@ -25,7 +25,7 @@ def merge(
     from cli.console import progress_display, say_warning
     from mapfusion.formats.by_suffix import check_suffix
     from mapfusion.formats.qgis_style import write_styles
-    from mapfusion.merge.lines import MergeConfig
+    from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
     from predmapnet import __version__
     from predmapnet.errors import UserError

@@ -20,7 +20,7 @@ from mapfusion.formats.geojson import DECIMALS
 from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
-from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
+from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
@@ -266,23 +266,6 @@ def _stretches(
                 )
             )
     return result
-
-
-def settle(states: Integer, shortest: int) -> Integer:
-    """Give runs of fewer than ``shortest`` samples to the longer of their neighbours, the shortest run first.
-
-    A line that is shorter than that as a whole keeps its most frequent state.
-    """
-    states = states.copy()
-    while True:
-        found = runs(states)
-        short = [run for run in found if run[1] - run[0] < shortest]
-        if not short or len(found) == 1:
-            return states
-        start, stop, _ = min(short, key=lambda run: run[1] - run[0])
-        place = [run[0] for run in found].index(start)
-        beside = [found[i] for i in (place - 1, place + 1) if 0 <= i < len(found)]
-        states[start:stop] = max(beside, key=lambda run: run[1] - run[0])[2]
 
 
 def _compare_rings(

@@ -1,4 +1,4 @@
-"""Polylines and poses: resample, transform, clip, measure."""
+"""Geometry of polylines and poses: resample, transform, clip, measure."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ from scipy.spatial import cKDTree
 from mapfusion.elements import RegionOfInterest
 
 Float = NDArray[np.float64]
+Integer = NDArray[np.int64]
+
+UNIT_TOLERANCE = 1e-14
+"""A squared quaternion length this close to 1 is 1."""
 
 
 def arc_length(points: Float) -> Float:
@@ -39,6 +43,65 @@ def resample(points: Float, count: int) -> Float:
         return np.repeat(np.asarray(points[:1], dtype=np.float64), count, axis=0)
     stations = np.linspace(0.0, distance[-1], count)
     return np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=1)
+
+
+def tangents(points: Float, stops: Integer | None = None) -> Float:
+    """Return unit directions at the vertices of lines, from their neighbours.
+
+    Args:
+        points: ``(n, 2)``, metres, lines of at least two vertices end to end.
+        stops: ascending, past the last vertex of each line; one line if None.
+
+    Returns:
+        ``(n, 2) float64``.
+    """
+    stops = np.array([len(points)]) if stops is None else stops
+    step = np.empty_like(points)
+    step[1:-1] = points[2:] - points[:-2]
+    first, last = np.append(0, stops[:-1]), stops - 1
+    step[first] = points[first + 1] - points[first]
+    step[last] = points[last] - points[last - 1]
+    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
+    return step / np.maximum(length, 1e-9)[:, None]
+
+
+def rigid_pose_problem(a_to_b: Float) -> str | None:
+    """Return the fault of a pose, or None: it must be ``(4, 4)``, finite and rigid."""
+    pose = np.asarray(a_to_b)
+    if pose.shape != (4, 4):
+        return "pose is not 4 x 4"
+    if not np.isfinite(pose).all():
+        return "pose is not finite"
+    rotation = pose[:3, :3]
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or determinant < 0:
+        return "pose is not rigid"
+    return None
+
+
+def rotation_of_quaternion(quaternion: Float) -> Float:
+    """Return the rotation matrices of quaternions.
+
+    Args:
+        quaternion: ``(..., 4)``, order w, x, y, z; normalised here.
+
+    Returns:
+        ``(..., 3, 3) float64``.
+    """
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    square = w * w + x * x + y * y + z * z
+    # Order and grouping of the operations are those of the reader that the official data sets use. Their ground truth
+    # depends on the last bits of poses, so nothing here may go through a matrix product, whose bits vary by machine.
+    length = np.where(np.abs(1.0 - square) < UNIT_TOLERANCE, 1.0, np.sqrt(square))
+    w, x, y, z = w / length, x / length, y / length, z / length
+    left = ((x, w, -z, y), (y, z, w, -x), (z, -y, x, w))
+    right = ((x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
+    rows = [
+        [row[0] * column[0] + row[1] * column[1] + row[2] * column[2] + row[3] * column[3] for column in right]
+        for row in left
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def transform_points(a_to_b: Float, points_a: Float) -> Float:

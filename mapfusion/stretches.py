@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mapfusion.geometry import arc_length
-from mapfusion.integrate.matching import tangents
+from mapfusion.geometry import arc_length, tangents
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
@@ -172,13 +171,28 @@ def _serve(
         owner[others[free]] = line
 
 
-def runs(values: NDArray[np.int64], breaks: NDArray[np.bool_] | None = None) -> list[tuple[int, int, int]]:
-    """Return ``(start, stop, value)`` of the runs of equal values; ``breaks[i]`` starts a new run at ``i``."""
+def runs(values: Integer) -> list[tuple[int, int, int]]:
+    """Return ``(start, stop, value)`` of the runs of equal values."""
     if not len(values):
         return []
     new = np.append(True, np.diff(values) != 0)
-    if breaks is not None:
-        new |= breaks
     starts = np.flatnonzero(new)
     stops = np.append(starts[1:], len(values))
     return list(zip(starts.tolist(), stops.tolist(), values[starts].tolist(), strict=True))
+
+
+def settle(states: Integer, shortest: int) -> Integer:
+    """Give runs of fewer than ``shortest`` samples to the longer of their neighbours, the shortest run first.
+
+    A line that is shorter than that as a whole keeps its most frequent state.
+    """
+    states = states.copy()
+    while True:
+        found = runs(states)
+        short = [run for run in found if run[1] - run[0] < shortest]
+        if not short or len(found) == 1:
+            return states
+        start, stop, _ = min(short, key=lambda run: run[1] - run[0])
+        place = [run[0] for run in found].index(start)
+        beside = [found[i] for i in (place - 1, place + 1) if 0 <= i < len(found)]
+        states[start:stop] = max(beside, key=lambda run: run[1] - run[0])[2]

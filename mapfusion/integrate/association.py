@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from mapfusion.geometry import tangents
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.fused_line import FusedLine
-from mapfusion.integrate.matching import Correspondence, correspond, tangents_of_all
+from mapfusion.integrate.matching import Correspondence, correspond
 from mapfusion.integrate.observations import Observation
 
 Float = NDArray[np.float64]
@@ -69,7 +70,7 @@ def gather(lines: Mapping[int, FusedLine], low: Float, high: Float) -> LocalStat
         owner,
         inside - (ends - sizes).take(owner),
         points.take(inside, axis=0) - low,
-        tangents_of_all(points, ends).take(inside, axis=0),
+        tangents(points, ends).take(inside, axis=0),
     )
 
 

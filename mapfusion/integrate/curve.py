@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.integrate.marks import Marks
+
 Float = NDArray[np.float64]
-Marks = NDArray[np.uint64]
 
 INFORMATION, SEEN, SEEN_VIEW, OBSERVATIONS, SCATTER = range(5)
 """Columns of :attr:`Curve.sums`."""

@@ -15,7 +15,8 @@ from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.curve import Curve
-from mapfusion.integrate.fused_line import Evidence, FusedLine
+from mapfusion.integrate.evidence import Evidence
+from mapfusion.integrate.fused_line import FusedLine
 from mapfusion.integrate.fused_ring import FusedRing
 from mapfusion.integrate.uncertainty import line_deviations, ring_deviations
 from mapfusion.integrate.views import ViewGrid

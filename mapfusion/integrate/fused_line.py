@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind
+from mapfusion.geometry import tangents
 from mapfusion.integrate.curve import INFORMATION, SCATTER, Curve
-from mapfusion.integrate.matching import Correspondence, correspond, tangents
-from mapfusion.integrate.observations import Track
+from mapfusion.integrate.evidence import Evidence
+from mapfusion.integrate.matching import Correspondence, correspond
 
 Float = NDArray[np.float64]
 
@@ -19,36 +20,6 @@ BLEND_LENGTH = 10.0
 """Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
 
 ONES = np.ones(2)
-
-
-@dataclass
-class Evidence:
-    """What is known of an element as a whole."""
-
-    first_seen: int
-    last_seen: int
-    observations: int = 1
-    tracks: dict[Track, int] = field(default_factory=dict)
-    """Track to the number of frames in which it was fused into this element."""
-    beside: dict[int, int] = field(default_factory=dict)
-    """Element id to the number of frames that showed it beside this one."""
-
-    def sighted(self, track: Track, timestamp: int, again: bool = False) -> None:
-        """Count one frame of a track; ``again`` where another observation of the same frame was counted."""
-        self.first_seen = min(self.first_seen, timestamp)
-        self.last_seen = max(self.last_seen, timestamp)
-        self.observations += not again
-        self.tracks[track] = self.tracks.get(track, 0) + 1
-
-    def absorb(self, other: Evidence) -> None:
-        """Add what is known of an element that turned out to be this one."""
-        self.first_seen = min(self.first_seen, other.first_seen)
-        self.last_seen = max(self.last_seen, other.last_seen)
-        self.observations += other.observations
-        for track, count in other.tracks.items():
-            self.tracks[track] = self.tracks.get(track, 0) + count
-        for element, count in other.beside.items():
-            self.beside[element] = self.beside.get(element, 0) + count
 
 
 @dataclass

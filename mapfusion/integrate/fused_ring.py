@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose, transform_points
 from mapfusion.integrate.config import IntegratorConfig
-from mapfusion.integrate.fused_line import Evidence
+from mapfusion.integrate.evidence import Evidence
+from mapfusion.integrate.marks import Marks
 from mapfusion.integrate.observations import Observation
 from mapfusion.level_lines import level_polygons
 
 Float = NDArray[np.float64]
 Grid = NDArray[np.float32]
 Integer = NDArray[np.int64]
-Marks = NDArray[np.uint64]
 Window = tuple[slice, slice]
 
 TRUNCATION = 1.5

@@ -11,14 +11,16 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
+from mapfusion.geometry import rigid_pose_problem
 from mapfusion.ground import ground_problem
 from mapfusion.integrate.assembly import Assembly
 from mapfusion.integrate.association import Candidate, assign, candidates, gather
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.curve import Curve
+from mapfusion.integrate.evidence import Evidence, Track
 from mapfusion.integrate.extraction import line_elements, ring_elements
 from mapfusion.integrate.frame_log import Journal
-from mapfusion.integrate.fused_line import Evidence, FusedLine, beside, fuse
+from mapfusion.integrate.fused_line import FusedLine, beside, fuse
 from mapfusion.integrate.fused_ring import (
     FusedRing,
     RingSighting,
@@ -30,7 +32,7 @@ from mapfusion.integrate.fused_ring import (
     room_of,
     sight,
 )
-from mapfusion.integrate.observations import Observation, Track, observe, pose_problem
+from mapfusion.integrate.observations import Observation, observe
 from mapfusion.integrate.state import load_state, save_state
 from mapfusion.integrate.tile_index import TileIndex
 from mapfusion.integrate.uncertainty import PRIOR_SHARES, PROBE_SPACING, ErrorModel
@@ -87,7 +89,7 @@ class MapIntegrator:
                 ids of two drives are two tracks.
         """
         problem = (
-            pose_problem(frame_map.ego_to_global)
+            rigid_pose_problem(frame_map.ego_to_global)
             or ground_problem(frame_map)
             or self.journal.enter(log, frame_map.timestamp, frame_map.ego_to_global[:2, 3], self.config.max_speed)
         )

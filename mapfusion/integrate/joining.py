@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapfusion.chains import LineEnd, chain_lines
 from mapfusion.elements import MapElement, united
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
@@ -22,8 +23,6 @@ from mapfusion.tidying import tidy
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
-End = tuple[int, int]
-"""Which element, and 0 for its start or -1 for its end."""
 
 DIRECTION_LENGTH = 4.0
 """The direction of an end is that of the last so many metres."""
@@ -47,7 +46,7 @@ class Link:
     """
 
     cost: float
-    ends: tuple[End, End]
+    ends: tuple[LineEnd, LineEnd]
     overlap: float
 
 
@@ -159,30 +158,14 @@ def chained(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple
     """Join along links, each end once, in their order.
 
     Returns:
-        The number of the first piece of each element, ascending, and the element.
+        The least number among the pieces of each element, ascending, and the element.
     """
-    parts: dict[int, MapElement] = dict(enumerate(elements))
-    used: set[End] = set()
-    # where the outer ends of joined pieces are now, and the way back
-    at: dict[End, End] = {}
-    was: dict[End, End] = {}
-    for link in links:
-        if not used.isdisjoint(link.ends):
-            continue
-        used.update(link.ends)
-        (one, end), (two, start) = (at.get(outer, outer) for outer in link.ends)
-        if one == two:
-            parts[one] = _closed(parts[one])
-            continue
-        before = parts[one] if end == -1 else _reversed(parts[one])
-        after = parts[two] if start == 0 else _reversed(parts[two])
-        keep, drop = min(one, two), max(one, two)
-        del parts[drop]
-        parts[keep] = _joined(before, after, link.overlap)
-        outer_ends = [was.get(other, other) for other in ((one, -1 - end), (two, -1 - start))]
-        for outer, now in zip(outer_ends, ((keep, 0), (keep, -1)), strict=True):
-            at[outer], was[now] = now, outer
-    return sorted(parts.items())
+
+    def join(before: MapElement, after: MapElement, number: int) -> MapElement:
+        return _joined(before, after, links[number].overlap)
+
+    chains = chain_lines(elements, [link.ends for link in links], _reversed, join, _closed)
+    return sorted(((min(chain.members), chain.line) for chain in chains), key=lambda found: found[0])
 
 
 def _reversed(element: MapElement) -> MapElement:

@@ -46,32 +46,6 @@ class Correspondence:
         return Correspondence(station, self.vertex, self.offset, self.distance, self.same_way)
 
 
-def tangents(points: Float) -> Float:
-    """Return unit directions ``(n, 2)`` at the vertices of a line ``(n, 2)``, from its neighbours."""
-    step = np.empty_like(points)
-    step[1:-1] = points[2:] - points[:-2]
-    step[0] = points[1] - points[0]
-    step[-1] = points[-1] - points[-2]
-    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
-    return step / np.maximum(length, 1e-9)[:, None]
-
-
-def tangents_of_all(points: Float, ends: Integer) -> Float:
-    """Return the tangents ``(n, 2)`` of several lines that stand one after the other.
-
-    Args:
-        points: ``(n, 2)``, metres, lines of at least two vertices.
-        ends: ascending, past the last vertex of each line.
-    """
-    step = np.empty_like(points)
-    step[1:-1] = points[2:] - points[:-2]
-    first, last = np.append(0, ends[:-1]), ends - 1
-    step[first] = points[first + 1] - points[first]
-    step[last] = points[last] - points[last - 1]
-    length = np.sqrt(step[:, 0] ** 2 + step[:, 1] ** 2)
-    return step / np.maximum(length, 1e-9)[:, None]
-
-
 def correspond(
     stations: Float,
     directions: Float,

@@ -5,24 +5,20 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, FrameMap
-from mapfusion.geometry import clip_line, transform_points
+from mapfusion.geometry import clip_line, tangents, transform_points
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, Curve
-from mapfusion.integrate.matching import tangents_of_all
-from mapfusion.integrate.uncertainty import place_mark, track_mark
+from mapfusion.integrate.evidence import Track
+from mapfusion.integrate.marks import place_mark, track_mark
 from mapfusion.integrate.views import view_weight
 
 Float = NDArray[np.float64]
-
-Track: TypeAlias = tuple[int, int]
-"""A track of a drive: number of the log, id within it. Different logs count their tracks from the same number."""
 
 SURE_SCORE = 0.5
 """A detection with this score is a whole sighting."""
@@ -55,21 +51,6 @@ class Observation:
     def sighting(self) -> float:
         """What the sighting counts for: 1 at :data:`SURE_SCORE`, in proportion to the score, at most 1.5."""
         return float(self.curve.seen[0])
-
-
-def pose_problem(ego_to_global: Float) -> str | None:
-    """Say what is wrong with a pose, or None: it must be ``(4, 4)``, finite and rigid."""
-    pose = np.asarray(ego_to_global)
-    if pose.shape != (4, 4):
-        return "pose is not 4 x 4"
-    if not np.isfinite(pose).all():
-        return "pose is not finite"
-    rotation = pose[:3, :3]
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or determinant < 0:
-        return "pose is not rigid"
-    return None
 
 
 def observe(
@@ -147,7 +128,7 @@ def _observations(
     ids = frame_map.track_ids[rows].tolist()
     marks[:, TRACKS] = np.repeat(np.array([track_mark(log, track) for track in ids], dtype=np.uint64), sizes)
     points = transform_points(frame_map.ego_to_global, local)
-    directions = tangents_of_all(points, ends)
+    directions = tangents(points, ends)
     curve = Curve(points, sums, marks)
     return [
         Observation(

@@ -17,8 +17,9 @@ from mapfusion.elements import ElementKind
 from mapfusion.files import write_whole
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.curve import Curve
+from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.frame_log import LogBook
-from mapfusion.integrate.fused_line import Evidence, FusedLine
+from mapfusion.integrate.fused_line import FusedLine
 from mapfusion.integrate.fused_ring import FusedRing
 from mapfusion.integrate.uncertainty import ErrorModel
 

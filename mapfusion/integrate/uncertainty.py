@@ -12,7 +12,6 @@ observations.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +20,12 @@ from scipy.optimize import nnls
 from scipy.special import expit
 
 from mapfusion.integrate.curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, Curve
-
-if TYPE_CHECKING:
-    from mapfusion.integrate.fused_ring import FusedRing
+from mapfusion.integrate.fused_ring import FusedRing
+from mapfusion.integrate.marks import PLACE, Marks, distinct
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
-Marks = NDArray[np.uint64]
 Record = tuple[int, Integer, Float, Float, Float, tuple[float, ...]]
-
-PLACE = 5.0
-"""Side of the cells in which it is noted from where the car saw a station, metres."""
 
 LASTING = np.array([10.0, 30.0])
 """Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
@@ -74,23 +68,6 @@ LEAST_VARIANCE = 1e-3
 
 LAGS = np.array([0.0, 2.5, 7.5, 15.0, 30.0, 60.0, np.inf])
 """Classes of the distance that the car went between two observations, metres."""
-
-
-def place_mark(log: int, position: Float) -> int:
-    """Return the bit that stands for where the car was: one of 64, neighbours differ."""
-    x, y = int(np.floor(position[0] / PLACE)), int(np.floor(position[1] / PLACE))
-    return 1 << ((x + 27 * y + 11 * log) % 64)
-
-
-def track_mark(log: int, track: int) -> int:
-    """Return the bit that stands for a track: one of 64."""
-    return 1 << ((track + 37 * log) % 64)
-
-
-def distinct(marks: Marks) -> Float:
-    """Estimate how many different things have left a mark (linear counting: Whang et al., TODS 1990), at least 1."""
-    free = np.maximum(64.0 - np.bitwise_count(marks), 0.5)
-    return np.asarray(np.maximum(-64.0 * np.log(free / 64.0), 1.0))
 
 
 @dataclass

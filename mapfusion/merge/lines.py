@@ -8,23 +8,20 @@ that the order of the maps matters to where the stations stand along the line, h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import logit
 
-from mapfusion.diff import settle
+from mapfusion.chains import LineEnd, chain_lines
 from mapfusion.elements import ElementKind, MapElement, united
-from mapfusion.geometry import arc_length
-from mapfusion.ground import inside
-from mapfusion.integrate.matching import tangents
+from mapfusion.geometry import arc_length, tangents
+from mapfusion.merge.config import MergeConfig
+from mapfusion.merge.contribution import Contribution, certainty, doubt, information
 from mapfusion.merge.tiles import Piece
-from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines
+from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
@@ -39,125 +36,8 @@ BLEND_LENGTH = 10.0
 SHORTEST_LOOP = 20
 """A line of fewer stations is not closed when its ends meet."""
 
-VIEW_LENGTH = 60.0
-"""A car sees about this much of a road at a time, metres."""
-
-LOOK_REACH = 8.0
-"""What lies within twice this of an element was looked at as often as it, metres."""
-
 LINK_REACH = 2.5
 """A line goes on from a reference if it leaves it this close to the reference's end, metres."""
-
-
-@dataclass(frozen=True)
-class MergeConfig:
-    """What is assumed when maps are merged.
-
-    Attributes:
-        match_distance: stretches of different maps are one line if they lie this close, metres.
-        min_new: a stretch shorter than this beside a known line is noise, metres.
-        default_deviation: of a line whose file states none and that one frame saw, metres.
-        default_alike: share in the variance of such a line that is the same in all frames of a drive.
-        floor_deviation: no map is trusted to be better than this, since its poses err as a whole, metres.
-        miss_log_odds: what each frame takes from a line that the drive lacks though it looked there. Less than in one
-            drive, since what hides a line in one frame often hides it in the next.
-        miss_limit: the most that one map can take.
-        hit_log_odds: the most that each frame of a drive that saw a line can add, whatever confidence the file states.
-        log_odds_limit: more evidence than this from one map does not make it surer.
-        tile, margin: side of a tile, and how far beyond its sides it looks, metres.
-        simplify_tolerance: of the finished lines, metres.
-        min_length: shorter lines are left out, metres.
-        ring_overlap: intersection over union from which two crossings are one.
-        max_partners: a map is aligned with at most this many others, those that share most ground.
-        max_gap: gaps in the evidence up to this length are bridged, metres.
-    """
-
-    match_distance: float = 1.5
-    min_new: float = 2.0
-    default_deviation: float = 0.4
-    default_alike: float = 0.1
-    floor_deviation: float = 0.05
-    miss_log_odds: float = 0.15
-    miss_limit: float = 2.0
-    hit_log_odds: float = 1.0
-    log_odds_limit: float = 4.0
-    tile: float = 200.0
-    margin: float = 40.0
-    simplify_tolerance: float = 0.05
-    min_length: float = 1.0
-    ring_overlap: float = 0.25
-    max_partners: int = 12
-    max_gap: float = 5.0
-
-
-class Looks:
-    """In how many frames a drive has looked at a place, as far as its map tells: as often as it saw what is near.
-
-    Args:
-        elements: all that the map has around.
-    """
-
-    def __init__(self, elements: Iterable[MapElement]) -> None:
-        points, frames = [np.empty((0, 2))], [np.empty(0)]
-        for element in elements:
-            samples = shapely.get_coordinates(shapely.segmentize(shapely.LineString(element.points), LOOK_REACH))
-            points.append(samples)
-            frames.append(np.full(len(samples), frames_per_place(element)))
-        self._points, self._frames = np.concatenate(points), np.concatenate(frames)
-        self._tree = cKDTree(self._points) if len(self._points) else None
-
-    def at(self, points: Float) -> Float:
-        """Return the frames for each of ``(n, 2)`` points, metres; one frame where nothing is near."""
-        frames = np.ones(len(points))
-        if self._tree is not None and len(points):
-            distance, nearest = self._tree.query(points, distance_upper_bound=2.0 * LOOK_REACH)
-            near = np.isfinite(distance)
-            frames[near] = np.maximum(self._frames[nearest[near]], 1.0)
-        return frames
-
-
-def frames_per_place(element: MapElement) -> float:
-    """Return in about how many frames each place of an element was seen: a long one is never seen as a whole."""
-    size = float(np.linalg.norm(np.ptp(element.points, axis=0)))
-    return element.observations * VIEW_LENGTH / (VIEW_LENGTH + size)
-
-
-@dataclass(frozen=True)
-class Contribution:
-    """What one map has in a tile.
-
-    Attributes:
-        source: number of the map.
-        elements: of one kind, metres, corrected.
-        ground: what the map speaks of.
-        looks: in how many frames the drive looked where.
-    """
-
-    source: int
-    elements: Sequence[MapElement]
-    ground: shapely.Geometry
-    looks: Looks
-
-
-def information(element: MapElement, config: MergeConfig) -> Float:
-    """Inverse variance of a line at its vertices, ``(n,)``, 1 / m²: from the file, or from the number of frames."""
-    deviation = element.deviation
-    if deviation is None:
-        alike = config.default_alike + (1.0 - config.default_alike) / max(element.observations, 1)
-        deviation = np.full(len(element.points), config.default_deviation * np.sqrt(alike))
-    return np.asarray(1.0 / (deviation**2 + config.floor_deviation**2))
-
-
-def certainty(element: MapElement, config: MergeConfig) -> float:
-    """Log-odds that one map gives an element: by its confidence, no more than its frames can bear out."""
-    most = min(config.log_odds_limit, config.hit_log_odds * max(element.observations, 1))
-    return float(np.clip(logit(np.clip(element.confidence, 1e-3, 1 - 1e-3)), 0.2, most))
-
-
-def doubt(contribution: Contribution, points: Float, config: MergeConfig) -> Float:
-    """Log-odds that a map takes from what it lacks at ``(n, 2)`` points; more, the oftener its drive looked there."""
-    taken = np.minimum(config.miss_log_odds * contribution.looks.at(points), config.miss_limit)
-    return np.asarray(taken * inside(contribution.ground, points))
 
 
 @dataclass
@@ -171,8 +51,8 @@ class _References:
     odds: Float = field(default_factory=lambda: np.empty(0))
     evidence: list[Piece] = field(default_factory=list)
     """One per line; only its counts and times are used."""
-    links: list[tuple[float, tuple[int, int], tuple[int, int]]] = field(default_factory=list)
-    """Gap in metres and two ends ``(line, 0 or -1)`` that are one line in some map."""
+    links: list[tuple[float, tuple[LineEnd, LineEnd]]] = field(default_factory=list)
+    """Gap in metres and two ends that are one line in some map."""
 
     def samples(self) -> Samples:
         direction = np.empty_like(self.points)
@@ -229,8 +109,9 @@ def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config:
         )
         for (start, stop), known in zip(references.spans(), references.evidence, strict=True)
     ]
-    chained = _chain(lines, references.links)
-    return [part for line in chained for part in _alive(line, config)]
+    links = [ends for _, ends in sorted(references.links)]
+    chains = chain_lines(lines, links, Piece.reversed, _blended, _closed)
+    return [part for chain in chains for part in _alive(chain.line, config)]
 
 
 def _contribute(references: _References, kind: ElementKind, contribution: Contribution, config: MergeConfig) -> Bool:
@@ -328,7 +209,7 @@ def _link(references: _References, nodes: list[tuple[int, int, int, int]], ends:
         start, backward = _end(references.points, ends[after[0]], enter)
         gap = float(np.linalg.norm(start - end))
         if gap < 2 * LINK_REACH and outward @ backward < -0.5:
-            references.links.append((gap, (before[0], leave), (after[0], enter)))
+            references.links.append((gap, ((before[0], leave), (after[0], enter))))
 
 
 def _end(points: Float, span: tuple[int, int], end: int) -> tuple[Float, Float]:
@@ -347,33 +228,12 @@ def _end_near(span: tuple[int, int], row: int) -> int | None:
     return -1 if span[1] - 1 - row <= reach else None
 
 
-def _chain(lines: list[Piece], links: list[tuple[float, tuple[int, int], tuple[int, int]]]) -> list[Piece]:
-    """Join linked lines end to end; each end once, the closest first."""
-    parts: dict[int, Piece] = dict(enumerate(lines))
-    ends: dict[tuple[int, int], tuple[int, int]] = {(i, e): (i, e) for i in parts for e in (0, -1)}
-    for _, first, second in sorted(links):
-        if first not in ends or second not in ends:
-            continue
-        (one, end), (two, start) = ends[first], ends[second]
-        if one == two:
-            if len(parts[one].points) >= SHORTEST_LOOP:
-                parts[one] = parts[one].closed()
-                del ends[first], ends[second]
-            continue
-        before = parts[one] if end == -1 else parts[one].reversed()
-        after = parts[two] if start == 0 else parts[two].reversed()
-        del ends[first], ends[second]
-        parts[one] = _blended(before, after)
-        del parts[two]
-        for key, (part, _) in list(ends.items()):
-            if part == one:
-                ends[key] = (one, 0)
-            elif part == two:
-                ends[key] = (one, -1)
-    return [parts[key] for key in sorted(parts)]
+def _closed(line: Piece) -> Piece | None:
+    """Return a line led back to its start, None where it is too short for that."""
+    return line.closed() if len(line.points) >= SHORTEST_LOOP else None
 
 
-def _blended(before: Piece, after: Piece) -> Piece:
+def _blended(before: Piece, after: Piece, _link: int) -> Piece:
     """Put two lines end to end; a step across them is spread over both, the less certain one moves more."""
     points = after.points
     direction = before.points[-1] - before.points[max(len(before.points) - 4, 0)]

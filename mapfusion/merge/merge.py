@@ -22,8 +22,10 @@ from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, ground_within, rings_around
+from mapfusion.merge.config import MergeConfig
+from mapfusion.merge.contribution import Contribution, Looks
 from mapfusion.merge.corrections import Correction, solve_corrections
-from mapfusion.merge.lines import Contribution, Looks, MergeConfig, fuse_lines
+from mapfusion.merge.lines import fuse_lines
 from mapfusion.merge.report import MapStatus, MergeReport, short_names
 from mapfusion.merge.rings import fuse_rings
 from mapfusion.merge.tiles import Piece, Stitcher, Tile, cut_line, tiles_of

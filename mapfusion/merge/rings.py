@@ -12,7 +12,8 @@ from scipy.special import expit
 
 from mapfusion.elements import MapElement, united
 from mapfusion.level_lines import level_polygons
-from mapfusion.merge.lines import Contribution, MergeConfig, certainty, doubt, information
+from mapfusion.merge.config import MergeConfig
+from mapfusion.merge.contribution import Contribution, certainty, doubt, information
 
 Float = NDArray[np.float64]
 

@@ -11,7 +11,8 @@ import pytest
 
 from mapfusion import ElementKind, FrameMap, MapIntegrator
 from mapfusion.integrate.curve import Curve
-from mapfusion.integrate.fused_line import Evidence, FusedLine
+from mapfusion.integrate.evidence import Evidence
+from mapfusion.integrate.fused_line import FusedLine
 from tests.mapfusion.simulation import ROI, pose
 
 pytestmark = pytest.mark.benchmark_only

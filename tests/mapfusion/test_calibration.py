@@ -9,15 +9,8 @@ import pytest
 
 from mapfusion import ElementKind, GlobalMap, MapIntegrator
 from mapfusion.diff import Change, DiffConfig, diff_maps
-from mapfusion.integrate.uncertainty import (
-    CAPACITY,
-    LASTING,
-    PROBE_SPACING,
-    ErrorModel,
-    distinct,
-    place_mark,
-    track_mark,
-)
+from mapfusion.integrate.marks import distinct, place_mark, track_mark
+from mapfusion.integrate.uncertainty import CAPACITY, LASTING, PROBE_SPACING, ErrorModel
 from mapfusion.merge.merge import merge_maps
 from tests.mapfusion.argoverse import LOGS
 from tests.mapfusion.calibration import CORRELATIONS, drives_of, errors_of, share_inside, standard_errors

@@ -14,10 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.diff import Change, DiffConfig, diff_maps, settle, write_diff
+from mapfusion.diff import Change, DiffConfig, diff_maps, write_diff
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import resample
 from mapfusion.ground import RIM, observed_rings
+from mapfusion.stretches import settle
 from tests.mapfusion.simulation import town_road
 
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING

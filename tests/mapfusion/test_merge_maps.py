@@ -14,8 +14,8 @@ from mapfusion.formats.by_suffix import read_map, write_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import arc_length
 from mapfusion.ground import RIM, coverage, near_elements, observed_rings
-from mapfusion.merge import lines as merged_lines
-from mapfusion.merge.lines import MergeConfig
+from mapfusion.merge.config import MergeConfig
+from mapfusion.merge.contribution import Looks, certainty
 from mapfusion.merge.merge import merge_files, merge_maps
 from mapfusion.merge.report import short_names
 from tests.mapfusion.map_quality import measure
@@ -290,14 +290,14 @@ def test_a_drive_that_looked_often_weighs_more_than_one_that_passed(frames, aliv
 
 def test_one_frame_is_not_believed_more_than_one_frame_can_say():
     sure = MergeConfig()
-    once, often = (merged_lines.certainty(middle(confidence=0.999, observations=n), sure) for n in (1, 10))
+    once, often = (certainty(middle(confidence=0.999, observations=n), sure) for n in (1, 10))
     assert once == pytest.approx(1.0)
     assert often == pytest.approx(sure.log_odds_limit)
 
 
 def test_a_long_line_was_not_seen_as_a_whole_in_every_frame():
     x = np.linspace(0.0, 540.0, 100)
-    looks = merged_lines.Looks([line(np.stack([x, 0 * x], axis=1), observations=100)])
+    looks = Looks([line(np.stack([x, 0 * x], axis=1), observations=100)])
     assert looks.at(np.array([[200.0, 5.0], [200.0, 40.0]])) == pytest.approx([10.0, 1.0])
 
 
