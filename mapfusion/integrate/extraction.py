@@ -14,13 +14,13 @@ from scipy.special import expit
 from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
-from mapfusion.integrate.curve import Curve
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.fused_line import FusedLine
 from mapfusion.integrate.fused_ring import FusedRing
+from mapfusion.integrate.station_curve import StationCurve
 from mapfusion.integrate.uncertainty import line_deviations, ring_deviations
 from mapfusion.integrate.views import ViewGrid
-from mapfusion.tidying import closes, hairpins, tidy
+from mapfusion.line_repair import closes, hairpins, repaired_rows
 
 Float = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def line_elements(
     elements = []
     stretches = _stretches(alive, int(config.max_gap / config.station_spacing))
     for start, stop in (part for stretch in stretches for part in _unfolded(points, *stretch)):
-        rows = start + tidy(points[start:stop])
+        rows = start + repaired_rows(points[start:stop])
         if len(rows) < 2 or arc_length(points[rows])[-1] < config.min_length:
             continue
         if closes(points[rows]):
@@ -88,7 +88,7 @@ def ring_elements(
     return [_element(ring.kind, points, float(expit(odds)), ring.evidence, deviation, logs)]
 
 
-def smooth(curve: Curve, config: IntegratorConfig) -> Float:
+def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
     """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information).
 
     Minimises ``sum information |z - p|² + sum |second difference of z|² / curvature_deviation²``.

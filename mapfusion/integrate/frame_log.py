@@ -1,4 +1,4 @@
-"""Which frames were taken in, to notice repeated ones and poses that jump."""
+"""Log of the frames that were taken in, to notice repeated ones and poses that jump."""
 
 from __future__ import annotations
 
@@ -14,13 +14,20 @@ Float = NDArray[np.float64]
 STANDSTILL = 3.0
 """Positions this close never count as a jump, metres."""
 
-NEIGHBOURS = 3
-"""Frames before and after that a pose is judged by."""
+JUDGES = 3
+"""Number of frames before and after by which a pose is judged."""
 
 
 @dataclass
-class LogBook:
-    """The frames of one log in the order of time: nanoseconds, metres, and whether each was believed."""
+class DriveLog:
+    """Frames of one drive in the order of time.
+
+    Attributes:
+        number: of the drive.
+        times: nanoseconds.
+        positions: of the car, metres, global frame.
+        believed: whether each pose was believed.
+    """
 
     number: int
     times: list[int] = field(default_factory=list)
@@ -28,16 +35,16 @@ class LogBook:
     believed: list[bool] = field(default_factory=list)
 
 
-class Journal:
-    """What is known of the frames of each log."""
+class FrameLog:
+    """Frames of all drives, by name of the drive."""
 
     def __init__(self) -> None:
-        self.logs: dict[str, LogBook] = {}
+        self.logs: dict[str, DriveLog] = {}
 
-    def book(self, log: str) -> LogBook:
-        """Return what is known of a log; logs are numbered as they appear."""
+    def drive(self, log: str) -> DriveLog:
+        """Return the frames of a drive; drives are numbered as they appear."""
         if log not in self.logs:
-            self.logs[log] = LogBook(len(self.logs))
+            self.logs[log] = DriveLog(len(self.logs))
         return self.logs[log]
 
     def enter(self, log: str, timestamp: int, position: Float, max_speed: float) -> str | None:
@@ -56,17 +63,17 @@ class Journal:
         Returns:
             What is wrong with the frame, or None.
         """
-        book = self.book(log)
-        place = bisect_left(book.times, timestamp)
-        if place < len(book.times) and book.times[place] == timestamp:
+        drive = self.drive(log)
+        place = bisect_left(drive.times, timestamp)
+        if place < len(drive.times) and drive.times[place] == timestamp:
             return "frame repeated"
         x, y = float(position[0]), float(position[1])
         votes = 0
-        for i in range(max(place - NEIGHBOURS, 0), min(place + NEIGHBOURS, len(book.times))):
-            distance = math.hypot(x - book.positions[i][0], y - book.positions[i][1])
-            near = distance <= STANDSTILL + max_speed * abs(timestamp - book.times[i]) * 1e-9
-            votes += (1 if near else -1) * (2 if book.believed[i] else 1)
-        book.times.insert(place, int(timestamp))
-        book.positions.insert(place, (x, y))
-        book.believed.insert(place, votes >= 0)
+        for i in range(max(place - JUDGES, 0), min(place + JUDGES, len(drive.times))):
+            distance = math.hypot(x - drive.positions[i][0], y - drive.positions[i][1])
+            near = distance <= STANDSTILL + max_speed * abs(timestamp - drive.times[i]) * 1e-9
+            votes += (1 if near else -1) * (2 if drive.believed[i] else 1)
+        drive.times.insert(place, int(timestamp))
+        drive.positions.insert(place, (x, y))
+        drive.believed.insert(place, votes >= 0)
         return None if votes >= 0 else "pose jumps"

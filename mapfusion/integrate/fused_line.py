@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind
 from mapfusion.geometry import tangents
-from mapfusion.integrate.curve import INFORMATION, SCATTER, Curve
 from mapfusion.integrate.evidence import Evidence
-from mapfusion.integrate.matching import Correspondence, correspond
+from mapfusion.integrate.matching import Correspondence, DirectedPoints, MatchLimits, correspond
+from mapfusion.integrate.station_curve import INFORMATION, SCATTER, StationCurve
 
 Float = NDArray[np.float64]
 
 BLEND_LENGTH = 10.0
 """Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
+
+END = 0.6
+"""A foot may lie this far past an end of the new curve, metres."""
 
 ONES = np.ones(2)
 
@@ -34,12 +37,12 @@ class FusedLine:
     """
 
     kind: ElementKind
-    curve: Curve
+    curve: StationCurve
     evidence: Evidence
     first: int = 0
 
 
-def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
+def fuse(line: FusedLine, new: StationCurve, match: Correspondence) -> list[StationCurve]:
     """Fuse a curve into a line that it lies beside, in place.
 
     Where both lie side by side, each station moves across the line to the mean weighted by information. Where the
@@ -62,7 +65,7 @@ def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
     first_foot, last_foot = base.points[station[head]] + offset[head], base.points[station[tail]] + offset[tail]
     gain = _average(base, new, match, vertex)
 
-    leftovers: list[Curve] = []
+    leftovers: list[StationCurve] = []
     parts = [base]
     if vertex[head] > 0:
         before = new.part(0, int(vertex[head]))
@@ -80,11 +83,11 @@ def fuse(line: FusedLine, new: Curve, match: Correspondence) -> list[Curve]:
         else:
             leftovers.append(after)
     if any(len(part) for part in parts if part is not base):
-        line.curve = Curve.join(parts)
+        line.curve = StationCurve.join(parts)
     return leftovers
 
 
-def _average(base: Curve, new: Curve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
+def _average(base: StationCurve, new: StationCurve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
     """Move stations to the weighted mean, in place; returns the new curve's share in it, ``(n,)``."""
     station = match.station
     added = new.sums.take(vertex, axis=0)
@@ -101,7 +104,7 @@ def _average(base: Curve, new: Curve, match: Correspondence, vertex: NDArray[np.
     return np.asarray(gain)
 
 
-def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
+def _extension(piece: StationCurve, foot: Float, shift: Float, base: Float) -> StationCurve:
     """Lead a piece over from the base's end and stop where it comes back to the base (a closed loop).
 
     Args:
@@ -130,7 +133,7 @@ def _extension(piece: Curve, foot: Float, shift: Float, base: Float) -> Curve:
             near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
             if near.any():
                 stop = max(int(near.argmax()), start)
-    return Curve(points[start:stop], piece.sums[start:stop], piece.marks[start:stop])
+    return StationCurve(points[start:stop], piece.sums[start:stop], piece.marks[start:stop])
 
 
 def squared(vector: Float) -> float:
@@ -138,16 +141,12 @@ def squared(vector: Float) -> float:
     return float(vector[0] * vector[0] + vector[1] * vector[1])
 
 
-def beside(base: Curve, new: Curve, reach: float, angle: float) -> Correspondence:
+def beside(base: StationCurve, new: StationCurve, reach: float, angle: float) -> Correspondence:
     """Return the stations of ``base`` beside ``new``."""
     origin = new.points[0]
     return correspond(
-        base.points - origin,
-        tangents(base.points),
+        DirectedPoints(base.points - origin, tangents(base.points)),
         np.zeros(len(base), dtype=np.int64),
-        new.points - origin,
-        tangents(new.points),
-        reach,
-        angle,
-        end=0.6,
+        DirectedPoints(new.points - origin, tangents(new.points)),
+        MatchLimits(reach, angle, END),
     )

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose, transform_points
-from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.marks import Marks
 from mapfusion.integrate.observations import Observation
@@ -274,7 +273,7 @@ def _scatter(ring: FusedRing, window: Window, information: Grid, distance: Grid)
     return float((known * information / (known + information) * (distance - level) ** 2).mean())
 
 
-def merge_rings(ring: FusedRing, other: FusedRing) -> None:
+def absorb_ring(ring: FusedRing, other: FusedRing) -> None:
     """Add all of another crossing to this one, in place."""
     ring.grow(other.corner, other.stop)
     other.grow(ring.corner, ring.stop)
@@ -285,6 +284,15 @@ def merge_rings(ring: FusedRing, other: FusedRing) -> None:
     ring.scatter += other.scatter
     ring.marks = ring.marks | other.marks
     ring.evidence.absorb(other.evidence)
+
+
+def same_ground(ring: FusedRing, other: FusedRing, share: float) -> bool:
+    """Whether two crossings overlap, with an intersection over union of at least ``share``."""
+    low, high = np.maximum(ring.corner, other.corner), np.minimum(ring.stop, other.stop)
+    if (high <= low).any():
+        return False
+    one, two = ring.level(ring.window(low, high)) > 0, other.level(other.window(low, high)) > 0
+    return bool(np.count_nonzero(one & two) >= share * np.count_nonzero(one | two))
 
 
 def overlap(ring: FusedRing, sighting: RingSighting) -> float:
@@ -298,8 +306,3 @@ def overlap(ring: FusedRing, sighting: RingSighting) -> float:
     held, inside = (ring.distance[window] > 0) & known, (seen.distance > 0) & known
     union = np.count_nonzero(held | inside)
     return float(np.count_nonzero(held & inside)) / union if union else 0.0
-
-
-def ring_match_threshold(ring: FusedRing, observation: Observation, config: IntegratorConfig) -> float:
-    """Return the overlap that a match takes: less where the track is known."""
-    return config.ring_overlap * (0.5 if observation.track in ring.evidence.tracks else 1.0)

@@ -19,7 +19,7 @@ from mapfusion.elements import MapElement, united
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.views import ViewGrid
-from mapfusion.tidying import tidy
+from mapfusion.line_repair import repaired_rows
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
@@ -189,7 +189,7 @@ def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement
     share = before.length / max(before.length + after.length, 1e-9)
     skip = int(len(two) > 1 and np.linalg.norm(two[0] - one[0]) < SAME_PLACE)
     points = np.concatenate([one[::-1], two[skip:]])
-    rows = tidy(points)
+    rows = repaired_rows(points)
     deviation: Float | None = None
     if one_deviation is not None and two_deviation is not None:
         deviation = np.concatenate([one_deviation[::-1], two_deviation[skip:]])[rows]

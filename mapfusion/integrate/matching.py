@@ -1,16 +1,46 @@
-"""Which stretch of one curve lies beside which stretch of another."""
+"""Matching of curves: which stations of the map lie beside which vertices of an observed curve."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
+
+
+class DirectedPoints(NamedTuple):
+    """Points of curves with the directions of the curves there.
+
+    Attributes:
+        points: ``(n, 2) float64``, metres.
+        directions: ``(n, 2) float64``, unit.
+    """
+
+    points: Float
+    directions: Float
+
+    def rows(self, rows: NDArray[np.intp]) -> DirectedPoints:
+        """Return some of the points."""
+        return DirectedPoints(self.points.take(rows, axis=0), self.directions.take(rows, axis=0))
+
+
+class MatchLimits(NamedTuple):
+    """Limits within which a station lies beside a curve.
+
+    Attributes:
+        reach: largest lateral distance, metres.
+        angle: largest angle between the directions, degrees.
+        end: how far past the first or last vertex a foot may lie, metres.
+    """
+
+    reach: float
+    angle: float
+    end: float
 
 
 @dataclass(frozen=True)
@@ -46,94 +76,121 @@ class Correspondence:
         return Correspondence(station, self.vertex, self.offset, self.distance, self.same_way)
 
 
-def correspond(
-    stations: Float,
-    directions: Float,
-    owner: Integer,
-    curve: Float,
-    curve_tangents: Float,
-    reach: float,
-    angle: float,
-    end: float,
-) -> Correspondence:
+def correspond(stations: DirectedPoints, owner: Integer, curve: DirectedPoints, limits: MatchLimits) -> Correspondence:
     """Find the stations that lie beside a curve and run along it, each line all of one way or all of the other.
 
     So a line that folds back on itself (the tip of a gore, the two sides of a narrow island) is matched side by side
     and never with the wrong side, however close both are.
 
     Args:
-        stations: ``(n, 2)``, metres, near the origin of coordinates (squares of large ones lose digits).
-        directions: ``(n, 2)``, unit.
+        stations: ``n`` of them, near the origin of coordinates (squares of large coordinates lose digits).
         owner: ``(n,)``, number of the line that each station belongs to.
-        curve: ``(m, 2)``, metres, vertices at equal distances.
-        curve_tangents: ``(m, 2)``, unit.
-        reach: largest lateral distance, metres.
-        angle: largest angle between the directions, degrees.
-        end: how far past the first or last vertex a foot may lie, metres.
+        curve: vertices at equal distances.
+        limits: how far apart and how oblique a match may be.
 
     Returns:
         The stations that match, in their order.
     """
-    (left, low), (right, high) = (curve.min(axis=0) - reach).tolist(), (curve.max(axis=0) + reach).tolist()
-    x, y = stations[:, 0], stations[:, 1]
+    reach = limits.reach
+    (left, low), (right, high) = (
+        (curve.points.min(axis=0) - reach).tolist(),
+        (curve.points.max(axis=0) + reach).tolist(),
+    )
+    x, y = stations.points[:, 0], stations.points[:, 1]
     (near,) = ((x > left) & (x < right) & (y > low) & (y < high)).nonzero()
-    points = stations.take(near, axis=0)
-    # |p - q|² without |p|², which does not change which q is nearest
-    square = (curve[:, 0] ** 2 + curve[:, 1] ** 2) - 2.0 * (points @ curve.T)
-    cosine = directions.take(near, axis=0) @ curve_tangents.T
-    one_way, any_way = cosine.min(axis=1) > 0.0, cosine.max(axis=1) > 0.0
+    pairs = _Pairs.of(stations.rows(near), curve)
     lines = owner.take(near)
     count = int(lines.max(initial=-1)) + 1
-    feet = partial(_feet, points, cosine, curve, curve_tangents, reach, angle, end)
-    if (one_way == any_way).all():
+    only_ahead, some_ahead = pairs.cosine.min(axis=1) > 0.0, pairs.cosine.max(axis=1) > 0.0
+    if (only_ahead == some_ahead).all():
         # nothing folds back: each station has a nearest vertex of one way only
-        vertex, offset, distance, keep = feet(square, one_way)
-        weight = np.where(one_way, reach - distance, distance - reach)
-        way = (np.bincount(lines[keep], weights=weight[keep], minlength=count) >= 0.0)[lines]
-        keep &= way == one_way
+        feet = _feet(pairs, pairs.square, only_ahead, limits)
+        weight = np.where(only_ahead, reach - feet.distance, feet.distance - reach)
+        ahead = (np.bincount(lines[feet.beside], weights=weight[feet.beside], minlength=count) >= 0.0)[lines]
+        beside = feet.beside & (ahead == only_ahead)
     else:
-        found = [
-            feet(np.where((cosine > 0.0) == ahead, square, np.inf), np.full(len(near), ahead))
-            for ahead in (True, False)
-        ]
-        same, opposite = (
-            np.bincount(lines[kept], weights=reach - away[kept], minlength=count) for _, _, away, kept in found
+        along, against = (
+            _feet(pairs, np.where((pairs.cosine > 0.0) == way, pairs.square, np.inf), np.full(len(near), way), limits)
+            for way in (True, False)
         )
-        way = (same >= opposite)[lines]
-        vertex, offset, distance, keep = (
-            np.where(way if a.ndim == 1 else way[:, None], a, b) for a, b in zip(*found, strict=True)
+        support_along, support_against = (
+            np.bincount(lines[feet.beside], weights=reach - feet.distance[feet.beside], minlength=count)
+            for feet in (along, against)
         )
-    (kept,) = keep.nonzero()
-    return Correspondence(near, vertex, offset, distance, way).rows(kept)
+        ahead = (support_along >= support_against)[lines]
+        feet = along.where(ahead, against)
+        beside = feet.beside
+    (kept,) = beside.nonzero()
+    return Correspondence(near, feet.vertex, feet.offset, feet.distance, ahead).rows(kept)
 
 
-def _feet(
-    points: Float,
-    cosine: Float,
-    curve: Float,
-    curve_tangents: Float,
-    reach: float,
-    angle: float,
-    end: float,
-    square: Float,
-    ahead: NDArray[np.bool_],
-) -> tuple[Integer, Float, Float, NDArray[np.bool_]]:
-    """Return nearest vertex, offset, distance, and which stations lie beside the curve.
+class _Pairs(NamedTuple):
+    """All pairs of a station and a vertex.
+
+    Attributes:
+        stations: ``n`` of them.
+        curve: its ``m`` vertices.
+        square: ``(n, m)``, rises with the distance between station and vertex.
+        cosine: ``(n, m)``, of the angle between their directions.
+    """
+
+    stations: DirectedPoints
+    curve: DirectedPoints
+    square: Float
+    cosine: Float
+
+    @classmethod
+    def of(cls, stations: DirectedPoints, curve: DirectedPoints) -> _Pairs:
+        # |p - q|² without |p|², which does not change which q is nearest
+        own = curve.points[:, 0] ** 2 + curve.points[:, 1] ** 2
+        square = own - 2.0 * (stations.points @ curve.points.T)
+        return cls(stations, curve, square, stations.directions @ curve.directions.T)
+
+
+class _Feet(NamedTuple):
+    """Feet of stations on a curve, as arrays of equal length.
+
+    Attributes:
+        vertex: nearest vertex.
+        offset: ``(n, 2)``, metres, from the station across to the curve.
+        distance: length of the offset, metres.
+        beside: whether the station lies within the limits.
+    """
+
+    vertex: Integer
+    offset: Float
+    distance: Float
+    beside: NDArray[np.bool_]
+
+    def where(self, chosen: NDArray[np.bool_], other: _Feet) -> _Feet:
+        """Return these feet where ``chosen`` is true, else the other ones."""
+        return _Feet(
+            np.where(chosen, self.vertex, other.vertex),
+            np.where(chosen[:, None], self.offset, other.offset),
+            np.where(chosen, self.distance, other.distance),
+            np.where(chosen, self.beside, other.beside),
+        )
+
+
+def _feet(pairs: _Pairs, square: Float, ahead: NDArray[np.bool_], limits: MatchLimits) -> _Feet:
+    """Find the foot of each station.
 
     Args:
-        points: ``(n, 2)``, metres.
-        cosine: ``(n, m)``, of the angle between station and vertex.
-        curve, curve_tangents, reach, angle, end: of :func:`correspond`.
-        square: ``(n, m)``, rises with the distance to each vertex.
+        pairs: of stations and vertices.
+        square: ``(n, m)``, rises with the distance; infinite for vertices that are no choice.
         ahead: ``(n,)``, whether the station must run along the curve or against it.
+        limits: of a match.
     """
+    curve = pairs.curve
     vertex = square.argmin(axis=1)
-    tangent = curve_tangents.take(vertex, axis=0)
-    gap = curve.take(vertex, axis=0) - points
+    tangent = curve.directions.take(vertex, axis=0)
+    gap = curve.points.take(vertex, axis=0) - pairs.stations.points
     along = gap[:, 0] * tangent[:, 0] + gap[:, 1] * tangent[:, 1]
     offset = gap - along[:, None] * tangent
     distance = np.sqrt(offset[:, 0] ** 2 + offset[:, 1] ** 2)
-    turn = cosine.take(np.arange(0, cosine.size, len(curve)) + vertex)
-    aligned = np.where(ahead, turn, -turn) > math.cos(math.radians(angle))
-    past = ((vertex == 0) & (along > end)) | ((vertex == len(curve) - 1) & (along < -end))
-    return vertex, offset, distance, (distance < reach) & aligned & ~past & (np.abs(along) < reach)
+    last = len(curve.points) - 1
+    turn = pairs.cosine.take(np.arange(0, pairs.cosine.size, last + 1) + vertex)
+    aligned = np.where(ahead, turn, -turn) > math.cos(math.radians(limits.angle))
+    past = ((vertex == 0) & (along > limits.end)) | ((vertex == last) & (along < -limits.end))
+    beside = (distance < limits.reach) & aligned & ~past & (np.abs(along) < limits.reach)
+    return _Feet(vertex, offset, distance, beside)

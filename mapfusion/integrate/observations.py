@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from mapfusion.elements import ElementKind, FrameMap
 from mapfusion.geometry import clip_line, tangents, transform_points
 from mapfusion.integrate.config import IntegratorConfig
-from mapfusion.integrate.curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, Curve
 from mapfusion.integrate.evidence import Track
 from mapfusion.integrate.marks import place_mark, track_mark
+from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, StationCurve
 from mapfusion.integrate.views import view_weight
 
 Float = NDArray[np.float64]
@@ -39,7 +39,7 @@ class Observation:
 
     kind: ElementKind
     track: Track
-    curve: Curve
+    curve: StationCurve
     directions: Float
 
     @property
@@ -129,7 +129,7 @@ def _observations(
     marks[:, TRACKS] = np.repeat(np.array([track_mark(log, track) for track in ids], dtype=np.uint64), sizes)
     points = transform_points(frame_map.ego_to_global, local)
     directions = tangents(points, ends)
-    curve = Curve(points, sums, marks)
+    curve = StationCurve(points, sums, marks)
     return [
         Observation(
             kind=ElementKind(kind),

@@ -1,4 +1,4 @@
-"""The integrator's state on disk: arrays and JSON in one ``.npz`` file, no pickle."""
+"""State of the integrator, in memory and on disk: arrays and JSON in one ``.npz`` file, no pickle."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,37 +16,65 @@ from numpy.typing import NDArray
 from mapfusion.elements import ElementKind
 from mapfusion.files import write_whole
 from mapfusion.integrate.config import IntegratorConfig
-from mapfusion.integrate.curve import Curve
 from mapfusion.integrate.evidence import Evidence
-from mapfusion.integrate.frame_log import LogBook
+from mapfusion.integrate.frame_log import DriveLog, FrameLog
 from mapfusion.integrate.fused_line import FusedLine
 from mapfusion.integrate.fused_ring import FusedRing
+from mapfusion.integrate.station_curve import StationCurve
 from mapfusion.integrate.uncertainty import ErrorModel
+from mapfusion.integrate.views import ViewGrid
 
-if TYPE_CHECKING:
-    from mapfusion.integrate.integrator import MapIntegrator
-
-FORMAT = 3
+STATE_VERSION = 3
 """Version of the file's layout; files of another version are refused."""
 
 Item = TypeVar("Item")
 
 
-def save_state(integrator: MapIntegrator, path: Path) -> None:
-    """Write everything an integrator knows; the file appears complete or not at all.
+@dataclass
+class IntegratorState:
+    """All that a map integrator knows; everything else that it holds follows from this.
+
+    Attributes:
+        config: assumptions about the detector and the road.
+        rejections: what was left out, counted by reason.
+        frames: number of frames that were fused.
+        next_id: id of the next new element.
+        frame_log: which frames of which drives were taken in.
+        errors: what was learnt of the detector's errors.
+        lines: dividers and boundaries by id.
+        rings: crossings by id.
+        views: where the car has looked.
+    """
+
+    config: IntegratorConfig = field(default_factory=IntegratorConfig)
+    rejections: Counter[str] = field(default_factory=Counter)
+    frames: int = 0
+    next_id: int = 0
+    frame_log: FrameLog = field(default_factory=FrameLog)
+    errors: ErrorModel = field(default_factory=ErrorModel)
+    lines: dict[int, FusedLine] = field(default_factory=dict)
+    rings: dict[int, FusedRing] = field(default_factory=dict)
+    views: ViewGrid = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.views = ViewGrid(self.config)
+
+
+def save_state(state: IntegratorState, path: Path) -> None:
+    """Write the state of an integrator; the file appears complete or not at all.
 
     Raises:
         OSError: the file cannot be written.
     """
-    lines, rings, tiles = integrator.lines, integrator.rings, integrator.views.tiles
+    lines, rings, tiles = state.lines, state.rings, state.views.tiles
     curves = [line.curve for line in lines.values()]
     header = {
-        "format": FORMAT,
-        "config": asdict(integrator.config),
-        "rejections": dict(integrator.rejections),
-        "frames": integrator.frames,
-        "next_id": integrator.next_id,
-        "logs": {log: [book.times, book.positions, book.believed] for log, book in integrator.journal.logs.items()},
+        "format": STATE_VERSION,
+        "config": asdict(state.config),
+        "rejections": dict(state.rejections),
+        "frames": state.frames,
+        "next_id": state.next_id,
+        "logs": {log: [drive.times, drive.positions, drive.believed] for log, drive in state.frame_log.logs.items()},
         "lines": [
             {
                 "id": i,
@@ -76,7 +104,7 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
         "sums": _flat(curves, lambda curve: curve.sums.ravel(), np.float64),
         "marks": _flat(curves, lambda curve: curve.marks.ravel(), np.uint64),
         "ring_marks": _flat(rings.values(), lambda ring: ring.marks, np.uint64),
-        "errors": integrator.errors.state(),
+        "errors": state.errors.state(),
         "ring_distance": _flat(rings.values(), lambda ring: ring.distance.ravel(), np.float32),
         "ring_looked": _flat(rings.values(), lambda ring: ring.looked.ravel(), np.float32),
         "ring_seen_view": _flat(rings.values(), lambda ring: ring.seen_view.ravel(), np.float32),
@@ -86,8 +114,8 @@ def save_state(integrator: MapIntegrator, path: Path) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def load_state(integrator: MapIntegrator, path: Path) -> None:
-    """Fill an empty integrator with what a file of :func:`save_state` holds.
+def load_state(path: Path) -> IntegratorState:
+    """Read the state that :func:`save_state` wrote.
 
     Raises:
         ValueError: not such a file.
@@ -99,27 +127,31 @@ def load_state(integrator: MapIntegrator, path: Path) -> None:
         header = json.loads(arrays["header"].tobytes())
     except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
         raise ValueError(f"{path}: not the saved state of a map integrator: {error}") from error
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: layout {header.get('format')} of another version; this one reads {FORMAT}")
-    _restore(integrator, header, arrays)
+    if header.get("format") != STATE_VERSION:
+        raise ValueError(f"{path}: layout {header.get('format')} of another version; this one reads {STATE_VERSION}")
+    return _restored(header, arrays)
 
 
-def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
-    integrator.config = IntegratorConfig(**header["config"])
-    integrator.views.config = integrator.config
-    integrator.rejections = Counter(header["rejections"])
-    integrator.frames, integrator.next_id = header["frames"], header["next_id"]
-    integrator.journal.logs = {
-        log: LogBook(number, times, [(x, y) for x, y in positions], believed)
+def _restored(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> IntegratorState:
+    state = IntegratorState(
+        config=IntegratorConfig(**header["config"]),
+        rejections=Counter(header["rejections"]),
+        frames=header["frames"],
+        next_id=header["next_id"],
+        errors=ErrorModel.from_state(arrays["errors"]),
+    )
+    state.frame_log.logs = {
+        log: DriveLog(number, times, [(x, y) for x, y in positions], believed)
         for number, (log, (times, positions, believed)) in enumerate(header["logs"].items())
     }
-    integrator.errors = ErrorModel.from_state(arrays["errors"])
-    curves = Curve(arrays["points"].reshape(-1, 2), arrays["sums"].reshape(-1, 5), arrays["marks"].reshape(-1, 2))
+    curves = StationCurve(
+        arrays["points"].reshape(-1, 2), arrays["sums"].reshape(-1, 5), arrays["marks"].reshape(-1, 2)
+    )
     at = 0
     for entry in header["lines"]:
         curve = curves.part(at, at + entry["count"]).copy()
         line = FusedLine(ElementKind(entry["kind"]), curve, _evidence(entry["evidence"]), entry["first"])
-        integrator.put_line(entry["id"], line)
+        state.lines[entry["id"]] = line
         at += len(curve)
     at = 0
     for entry, marks in zip(header["rings"], arrays["ring_marks"].reshape(-1, 2), strict=True):
@@ -131,11 +163,12 @@ def _restore(integrator: MapIntegrator, header: dict[str, Any], arrays: dict[str
         corner = np.array(entry["corner"], dtype=np.int64)
         evidence = _evidence(entry["evidence"])
         ring = FusedRing(corner, distance, looked, seen_view, entry["seen"], evidence, entry["scatter"], marks.copy())
-        integrator.put_ring(entry["id"], ring)
+        state.rings[entry["id"]] = ring
         at = part.stop
     tiles = [(int(row), int(column)) for row, column in header["tiles"]]
-    side = integrator.views.side
-    integrator.views.tiles = dict(zip(tiles, arrays["views"].reshape(len(tiles), side, side).copy(), strict=True))
+    side = state.views.side
+    state.views.tiles = dict(zip(tiles, arrays["views"].reshape(len(tiles), side, side).copy(), strict=True))
+    return state
 
 
 def _flat(items: Iterable[Item], part: Callable[[Item], NDArray[Any]], dtype: type) -> NDArray[Any]:

@@ -11,7 +11,9 @@ observations.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +21,12 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.special import expit
 
-from mapfusion.integrate.curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, Curve
 from mapfusion.integrate.fused_ring import FusedRing
 from mapfusion.integrate.marks import PLACE, Marks, distinct
+from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, StationCurve
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
-Record = tuple[int, Integer, Float, Float, Float, tuple[float, ...]]
 
 LASTING = np.array([10.0, 30.0])
 """Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
@@ -60,14 +61,101 @@ COMPANIONS = (1, 2, 3, 5, 8, 13)
 OUTLIER = 9.0 / 0.455
 """Squared differences count as at most so many medians: three deviations of a normal distribution."""
 
-SCRAMBLE = np.array([1.0, 1e5 + 0.7])
-"""Makes one number of two, different ones for different pairs."""
+HASH = np.array([1.0, 1e5 + 0.7])
+"""Weights that make one number of two."""
 
 LEAST_VARIANCE = 1e-3
 """No detector is better than this, as a multiple of the variance that it is assumed to have."""
 
 LAGS = np.array([0.0, 2.5, 7.5, 15.0, 30.0, 60.0, np.inf])
 """Classes of the distance that the car went between two observations, metres."""
+
+
+class Probe(NamedTuple):
+    """Where one detection passed some stations of an element.
+
+    Attributes:
+        element: id of the element.
+        stations: ``(n,) int64``, numbers of the stations.
+        feet: ``(n, 2) float64``, metres, where the detection passed each of them.
+        directions: ``(n, 2) float64``, unit, along the detection there.
+        information: ``(n,) float64``, of the detection, 1 / m².
+        car: ``(2,) float64``, metres, where it was seen from.
+        track: number of its track, different for different tracks of all logs.
+    """
+
+    element: int
+    stations: Integer
+    feet: Float
+    directions: Float
+    information: Float
+    car: Float
+    track: int
+
+
+class _Passages(NamedTuple):
+    """Passages of detections at stations, one row each, sorted by element and station; columns as in :class:`Probe`."""
+
+    element: Integer
+    station: Integer
+    foot: Float
+    direction: Float
+    information: Float
+    car: Float
+    track: Integer
+
+    @classmethod
+    def of(cls, probes: Sequence[Probe]) -> _Passages:
+        element, stations, feet, directions, information, car, track = zip(*probes, strict=True)
+        counts = [len(numbers) for numbers in stations]
+        passages = cls(
+            np.repeat(element, counts),
+            np.concatenate(stations),
+            np.concatenate(feet),
+            np.concatenate(directions),
+            np.concatenate(information),
+            np.repeat(np.array(car), counts, axis=0),
+            np.repeat(track, counts),
+        )
+        return passages.rows(np.lexsort((passages.station, passages.element)))
+
+    def rows(self, rows: NDArray[np.intp]) -> _Passages:
+        return _Passages._make(column[rows] for column in self)
+
+
+class _Differences(NamedTuple):
+    """Differences between two detections of one station, one row each.
+
+    Attributes:
+        other_track: 1 where they belong to two tracks, else 0.
+        lag: distance between the places that they were seen from, metres.
+        square: squared difference across the line, as a multiple of its assumed variance.
+        contrast: hash of what differences that hang together have in common: the element, and for one track the cell,
+            a lag wide, that the car was in, for two tracks both of them.
+    """
+
+    other_track: Integer
+    lag: Float
+    square: Float
+    contrast: Float
+
+    @classmethod
+    def between(cls, one: _Passages, two: _Passages) -> _Differences:
+        gap = one.foot - two.foot
+        across = gap[:, 0] * one.direction[:, 1] - gap[:, 1] * one.direction[:, 0]
+        square = across**2 / (1.0 / one.information + 1.0 / two.information)
+        lag = np.hypot(one.car[:, 0] - two.car[:, 0], one.car[:, 1] - two.car[:, 1])
+        other = one.track != two.track
+        cell = np.floor(one.car / np.maximum(lag, PLACE)[:, None]) @ HASH
+        contrast = one.element * HASH[1] + np.where(other, one.track + two.track, cell)
+        return cls(other.astype(np.int64), lag, square, contrast)
+
+
+def _first_of_equal(group: Integer, contrast: Float) -> NDArray[np.intp]:
+    """Return one row of each set of rows that are equal in both columns ``(n,)``, at least one row."""
+    order = np.lexsort((contrast, group))
+    new = (np.diff(group[order]) != 0) | (np.diff(contrast[order]) != 0.0)
+    return np.asarray(order[np.append(True, new)])
 
 
 @dataclass
@@ -85,82 +173,42 @@ class ErrorModel:
     lags: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
     pairs: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
     contrasts: Float = field(default_factory=lambda: np.zeros((2, len(LAGS) - 1)))
-    _records: list[Record] = field(default_factory=list)
+    _probes: list[Probe] = field(default_factory=list)
     _count: int = 0
 
-    def note(
-        self,
-        element: int,
-        numbers: Integer,
-        feet: Float,
-        directions: Float,
-        weight: Float,
-        seen_from: tuple[float, ...],
-    ) -> None:
-        """Keep where one detection lay, to compare it with others of the same stations.
-
-        Args:
-            element: id of the element.
-            numbers: ``(n,)``, which stations.
-            feet: ``(n, 2)``, metres, where the detection passed each station.
-            directions: ``(n, 2)``, unit, along the detection there.
-            weight: ``(n,)``, information of the detection, 1 / m².
-            seen_from: where the car was, two coordinates in metres, and the track's number.
-        """
-        self._records.append((element, numbers, feet, directions, weight, seen_from))
-        self._count += len(numbers)
+    def note(self, probe: Probe) -> None:
+        """Keep where one detection passed stations of an element, to compare it with others of the same stations."""
+        self._probes.append(probe)
+        self._count += len(probe.stations)
         if self._count >= CAPACITY:
             self.learn()
 
     def learn(self) -> None:
-        """Take the differences between the records kept so far, and forget them."""
-        if not self._records:
+        """Take the differences between the probes kept so far, and forget them."""
+        if not self._probes:
             return
-        elements, numbers, feet, directions, weight, seen_from = zip(*self._records, strict=True)
-        sizes = [len(part) for part in numbers]
-        number = np.concatenate(numbers)
-        order = np.lexsort((number, np.repeat(elements, sizes)))
-        records = np.column_stack(
-            [
-                np.repeat(elements, sizes),
-                number,
-                np.concatenate(feet),
-                np.concatenate(directions),
-                np.concatenate(weight),
-                np.repeat(np.array(seen_from), sizes, axis=0),
-            ]
-        )[order]
-        self._records, self._count = [], 0
-        seen: list[Float] = []
+        passages = _Passages.of(self._probes)
+        self._probes, self._count = [], 0
+        element, station = passages.element, passages.station
+        differences: list[_Differences] = []
         for step in COMPANIONS:
-            one, two = records[:-step], records[step:]
-            same = np.flatnonzero((one[:, 0] == two[:, 0]) & (one[:, 1] == two[:, 1]))
+            same = np.flatnonzero((element[:-step] == element[step:]) & (station[:-step] == station[step:]))
             if not len(same):
                 break
-            one, two = one[same], two[same]
-            gap = one[:, 2:4] - two[:, 2:4]
-            across = gap[:, 0] * one[:, 5] - gap[:, 1] * one[:, 4]
-            square = across**2 / (1.0 / one[:, 6] + 1.0 / two[:, 6])
-            lag = np.hypot(one[:, 7] - two[:, 7], one[:, 8] - two[:, 8])
-            # differences of one track from places less than a lag apart hang together, as do all of two tracks
-            other = one[:, 9] != two[:, 9]
-            block = np.floor(one[:, 7:9] / np.maximum(lag, PLACE)[:, None]) @ SCRAMBLE
-            tracks = one[:, 9] + two[:, 9]
-            seen.append(np.column_stack([other, lag, square, one[:, 0] * SCRAMBLE[1] + np.where(other, tracks, block)]))
-        if seen:
-            self._count_in(np.concatenate(seen))
+            differences.append(_Differences.between(passages.rows(same), passages.rows(same + step)))
+        if differences:
+            self._count_in(_Differences._make(map(np.concatenate, zip(*differences, strict=True))))
 
-    def _count_in(self, pairs: Float) -> None:
-        """Add pairs: other track or not, lag, squared difference, and a number for the contrast they belong to."""
-        other, lag, square, contrast = pairs.T
+    def _count_in(self, differences: _Differences) -> None:
+        other_track, lag, square, contrast = differences
         # two lines taken for one, or a ghost beside a line, say nothing of the detector's error
         square = np.minimum(square, OUTLIER * np.median(square))
-        group = other.astype(np.int64) * (len(LAGS) - 1) + np.searchsorted(LAGS, lag, side="right") - 1
+        group = other_track * (len(LAGS) - 1) + np.searchsorted(LAGS, lag, side="right") - 1
         shape = self.pairs.shape
         for total, values in ((self.squares, square), (self.lags, lag), (self.pairs, np.ones_like(lag))):
             total += np.bincount(group, weights=values, minlength=total.size).reshape(shape)
-        different = np.unique(group + 1j * contrast).real.astype(np.int64)
-        self.contrasts += np.bincount(different, minlength=self.contrasts.size).reshape(shape)
+        independent = group[_first_of_equal(group, contrast)]
+        self.contrasts += np.bincount(independent, minlength=self.contrasts.size).reshape(shape)
 
     def state(self) -> Float:
         """Return what was learnt, as one array for :meth:`from_state`; the records kept are taken in first."""
@@ -214,7 +262,7 @@ def _log_evidence(residual: Float, noise: Float, basis: Float) -> float:
     return float(-0.5 * (standard @ standard) - np.log(np.diag(factor)).sum())
 
 
-def line_deviations(curve: Curve, parts: Float, common: float) -> Float:
+def line_deviations(curve: StationCurve, parts: Float, common: float) -> Float:
     """Return the standard deviation of fused stations across the line, metres, ``(n,)``.
 
     Args:

@@ -13,7 +13,7 @@ from mapfusion.ground import ground_within
 from mapfusion.integrate.config import IntegratorConfig
 
 Float = NDArray[np.float64]
-Tile: TypeAlias = tuple[int, int]
+TileKey: TypeAlias = tuple[int, int]
 
 TILE_CELLS = 64
 """Cells of one metre along each side of a tile."""
@@ -62,7 +62,7 @@ class ViewGrid:
 
     def __init__(self, config: IntegratorConfig) -> None:
         self.config = config
-        self.tiles: dict[Tile, NDArray[np.float32]] = {}
+        self.tiles: dict[TileKey, NDArray[np.float32]] = {}
 
     def add(self, ego_to_global: Float, roi: RegionOfInterest, visible: shapely.Geometry | None = None) -> None:
         """Count one frame.

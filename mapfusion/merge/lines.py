@@ -20,7 +20,7 @@ from mapfusion.elements import ElementKind, MapElement, united
 from mapfusion.geometry import arc_length, tangents
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
-from mapfusion.merge.tiles import Piece
+from mapfusion.merge.tiles import MergedLine
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
 
 Float = NDArray[np.float64]
@@ -49,7 +49,7 @@ class _References:
     weight: Float = field(default_factory=lambda: np.empty(0))
     offset: Float = field(default_factory=lambda: np.empty((0, 2)))
     odds: Float = field(default_factory=lambda: np.empty(0))
-    evidence: list[Piece] = field(default_factory=list)
+    evidence: list[MergedLine] = field(default_factory=list)
     """One per line; only its counts and times are used."""
     links: list[tuple[float, tuple[LineEnd, LineEnd]]] = field(default_factory=list)
     """Gap in metres and two ends that are one line in some map."""
@@ -67,7 +67,7 @@ class _References:
         edges = np.searchsorted(self.line, np.arange(len(self.evidence) + 1))
         return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
-    def append(self, points: Float, weight: Float, odds: float, evidence: Piece) -> int:
+    def append(self, points: Float, weight: Float, odds: float, evidence: MergedLine) -> int:
         number = len(self.evidence)
         count = len(points)
         self.points = np.concatenate([self.points, points])
@@ -79,7 +79,7 @@ class _References:
         return number
 
 
-def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config: MergeConfig) -> list[Piece]:
+def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config: MergeConfig) -> list[MergedLine]:
     """Fuse the lines of one kind of several maps of one place.
 
     Args:
@@ -110,7 +110,7 @@ def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config:
         for (start, stop), known in zip(references.spans(), references.evidence, strict=True)
     ]
     links = [ends for _, ends in sorted(references.links)]
-    chains = chain_lines(lines, links, Piece.reversed, _blended, _closed)
+    chains = chain_lines(lines, links, MergedLine.reversed, _blended, _closed)
     return [part for chain in chains for part in _alive(chain.line, config)]
 
 
@@ -142,7 +142,7 @@ def _contribute(references: _References, kind: ElementKind, contribution: Contri
             number_of_stations = max(round((end - start - 1) / 2), 1) + 1
             place = np.linspace(rows.start, rows.stop - 1, number_of_stations)
             take = np.round(place).astype(np.int64)
-            evidence = Piece(
+            evidence = MergedLine(
                 kind,
                 np.empty((0, 2)),
                 np.empty((0, 2)),
@@ -228,12 +228,12 @@ def _end_near(span: tuple[int, int], row: int) -> int | None:
     return -1 if span[1] - 1 - row <= reach else None
 
 
-def _closed(line: Piece) -> Piece | None:
+def _closed(line: MergedLine) -> MergedLine | None:
     """Return a line led back to its start, None where it is too short for that."""
     return line.closed() if len(line.points) >= SHORTEST_LOOP else None
 
 
-def _blended(before: Piece, after: Piece, _link: int) -> Piece:
+def _blended(before: MergedLine, after: MergedLine, _link: int) -> MergedLine:
     """Put two lines end to end; a step across them is spread over both, the less certain one moves more."""
     points = after.points
     direction = before.points[-1] - before.points[max(len(before.points) - 4, 0)]
@@ -257,7 +257,7 @@ def _blended(before: Piece, after: Piece, _link: int) -> Piece:
     )
 
 
-def _alive(line: Piece, config: MergeConfig) -> list[Piece]:
+def _alive(line: MergedLine, config: MergeConfig) -> list[MergedLine]:
     """Return the stretches that more likely exist than not, short gaps bridged."""
     states = settle((line.values[:, 1] > 0.0).astype(np.int64), round(config.max_gap / SPACING))
     return [

@@ -22,14 +22,14 @@ from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, ground_within, rings_around
+from mapfusion.line_repair import repaired_rows
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, Looks
 from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.lines import fuse_lines
 from mapfusion.merge.report import MapStatus, MergeReport, short_names
 from mapfusion.merge.rings import fuse_rings
-from mapfusion.merge.tiles import Piece, Stitcher, Tile, cut_line, tiles_of
-from mapfusion.tidying import tidy
+from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, cut_line, tiles_of
 
 Float = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -101,7 +101,9 @@ def _align_in_worker(task: tuple[int, list[int]]) -> list[tuple[int, int, Alignm
     return _align_with(_shelf, *task)
 
 
-def _fuse_in_worker(task: tuple[Tile, list[int], Sequence[str], MergeConfig]) -> tuple[list[Piece], list[MapElement]]:
+def _fuse_in_worker(
+    task: tuple[Tile, list[int], Sequence[str], MergeConfig],
+) -> tuple[list[MergedLine], list[MapElement]]:
     return _fuse_tile(_shelf, *task)
 
 
@@ -264,8 +266,8 @@ class _Merge:
         for piece in stitcher.rest():
             yield from self._finished(piece)
 
-    def _finished(self, piece: Piece) -> Iterator[MapElement]:
-        rows = tidy(piece.points)
+    def _finished(self, piece: MergedLine) -> Iterator[MapElement]:
+        rows = repaired_rows(piece.points)
         points, values = piece.points[rows], piece.values[rows]
         line = shapely.LineString(points) if len(rows) > 1 else None
         if line is None or line.length < self.config.min_length:
@@ -337,7 +339,7 @@ def _align_with(shelf: _Shelf, place: int, others: Sequence[int]) -> list[tuple[
 
 def _fuse_tile(
     shelf: _Shelf, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
-) -> tuple[list[Piece], list[MapElement]]:
+) -> tuple[list[MergedLine], list[MapElement]]:
     """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings."""
     low, high = tile.low - config.margin, tile.high + config.margin
     loaded = []
@@ -345,7 +347,7 @@ def _fuse_tile(
         global_map, ground = shelf.corrected(place)
         around = Looks(part for element in global_map for part in _in_box(element, low, high))
         loaded.append((place, global_map, ground, around))
-    pieces: list[Piece] = []
+    pieces: list[MergedLine] = []
     rings: list[MapElement] = []
     for kind in ElementKind:
         contributions = []

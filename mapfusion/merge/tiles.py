@@ -106,7 +106,7 @@ def cut_line(points: Float, values: Float, low: Float, high: Float) -> list[tupl
 
 
 @dataclass
-class Piece:
+class MergedLine:
     """A line of the merged map, whole or cut at a tile's side.
 
     Attributes:
@@ -126,16 +126,16 @@ class Piece:
     last_seen: int
     origins: Origins = field(default_factory=dict)
 
-    def reversed(self) -> Piece:
+    def reversed(self) -> MergedLine:
         """Return it run the other way."""
         return replace(self, points=self.points[::-1], values=self.values[::-1])
 
-    def closed(self) -> Piece:
+    def closed(self) -> MergedLine:
         """Return it led back to its start."""
         points, values = np.vstack([self.points, self.points[:1]]), np.vstack([self.values, self.values[:1]])
         return replace(self, points=points, values=values)
 
-    def joined(self, other: Piece) -> Piece:
+    def joined(self, other: MergedLine) -> MergedLine:
         """Return this piece with another put to its end, their common point in the middle."""
         points = np.concatenate([self.points, other.points[1:]])
         values = np.concatenate([self.values, other.values[1:]])
@@ -144,13 +144,13 @@ class Piece:
         values[seam] = (self.values[-1] + other.values[0]) / 2
         return self.with_evidence_of(other, points, values)
 
-    def with_evidence_of(self, other: Piece, points: Float, values: Float) -> Piece:
+    def with_evidence_of(self, other: MergedLine, points: Float, values: Float) -> MergedLine:
         """Return the line that this piece and another are parts of."""
         counts = dict(self.observations)
         for source, count in other.observations.items():
             counts[source] = max(counts.get(source, 0), count)
         first, last = min(self.first_seen, other.first_seen), max(self.last_seen, other.last_seen)
-        return Piece(self.kind, points, values, counts, first, last, united([self.origins, other.origins]))
+        return MergedLine(self.kind, points, values, counts, first, last, united([self.origins, other.origins]))
 
 
 class Stitcher:
@@ -161,9 +161,9 @@ class Stitcher:
 
     def __init__(self, tiles: list[Tile]) -> None:
         self._waiting = set(tiles)
-        self._open: list[Piece] = []
+        self._open: list[MergedLine] = []
 
-    def add(self, tile: Tile, pieces: list[Piece]) -> Iterator[Piece]:
+    def add(self, tile: Tile, pieces: list[MergedLine]) -> Iterator[MergedLine]:
         """Take the pieces of one tile, cut at its sides, and yield the lines that no other tile can lengthen."""
         self._waiting.discard(tile)
         for piece in pieces:
@@ -176,12 +176,12 @@ class Stitcher:
                 yield piece
         self._open = still_open
 
-    def rest(self) -> Iterator[Piece]:
+    def rest(self) -> Iterator[MergedLine]:
         """Yield what is left when all tiles have come."""
         yield from self._open
         self._open = []
 
-    def _grown(self, tile: Tile, piece: Piece) -> Piece:
+    def _grown(self, tile: Tile, piece: MergedLine) -> MergedLine:
         """Join a piece to the open ones that it continues, at either end."""
         for _ in range(2):
             if tile.beyond(piece.points[0]) is not None:
@@ -208,7 +208,7 @@ class Stitcher:
         return any(Tile(row, column) in self._waiting for row in (low[1], high[1]) for column in (low[0], high[0]))
 
 
-def _seam_gap(before: Piece, after: Piece) -> float | None:
+def _seam_gap(before: MergedLine, after: MergedLine) -> float | None:
     """Return the distance from the end of one piece to the start of another that goes on from it, else None."""
     if before.kind is not after.kind:
         return None

@@ -91,7 +91,7 @@ def drive(mapper: Mapper, scene: Scene, frames: int, every: int) -> Iterator[Str
         integrator.add(replace(frame_map, ego_to_global=place), log=f"lap {lap}")
         integrating += time.process_time() - start
         if number % every == 0:
-            elements = len(integrator.lines) + len(integrator.rings)
+            elements = len(integrator.state.lines) + len(integrator.state.rings)
             tracks = int(state.instances.valid.sum())
             bytes_ = state_bytes(state)
             yield Stretch(number, mapping / every, integrating / every, tracks, bytes_, elements, resident_megabytes())

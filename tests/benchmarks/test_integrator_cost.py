@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mapfusion import ElementKind, FrameMap, MapIntegrator
-from mapfusion.integrate.curve import Curve
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.fused_line import FusedLine
+from mapfusion.integrate.station_curve import StationCurve
 from tests.mapfusion.simulation import ROI, pose
 
 pytestmark = pytest.mark.benchmark_only
@@ -48,7 +48,7 @@ def frames(count: int = 40) -> list[FrameMap]:
 def filled(size: int) -> MapIntegrator:
     """An integrator that holds ``size`` lines of 40 m on a square grid, the road among them."""
     integrator = MapIntegrator()
-    integrator.journal.book("earlier")
+    integrator.state.frame_log.drive("earlier")
     side = int(np.sqrt(size))
     x = np.linspace(0.0, 40.0, 41)
     for number in range(size):
@@ -56,10 +56,10 @@ def filled(size: int) -> MapIntegrator:
         points = np.stack([x + 50.0 * (column - side // 2), np.full(41, 8.0 * (row - side // 2) + 100.0)], axis=1)
         ones = np.ones(41)
         line = FusedLine(
-            ElementKind.DIVIDER, Curve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {(0, 1): 5})
+            ElementKind.DIVIDER, StationCurve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {(0, 1): 5})
         )
         integrator.put_line(number, line)
-    integrator.next_id = size
+    integrator.state.next_id = size
     return integrator
 
 

@@ -10,7 +10,7 @@ import pytest
 from mapfusion import ElementKind, GlobalMap, MapIntegrator
 from mapfusion.diff import Change, DiffConfig, diff_maps
 from mapfusion.integrate.marks import distinct, place_mark, track_mark
-from mapfusion.integrate.uncertainty import CAPACITY, LASTING, PROBE_SPACING, ErrorModel
+from mapfusion.integrate.uncertainty import CAPACITY, LASTING, PROBE_SPACING, ErrorModel, Probe
 from mapfusion.merge.merge import merge_maps
 from tests.mapfusion.argoverse import LOGS
 from tests.mapfusion.calibration import CORRELATIONS, drives_of, errors_of, share_inside, standard_errors
@@ -79,14 +79,16 @@ def learnt(new: float, lasting: float, track: float, frames: int = 12, elements:
         for frame in range(frames):
             slow = kept * slow + np.sqrt(1.0 - kept**2) * rng.normal()
             y = rng.normal(0.0, np.sqrt(new)) + np.sqrt(lasting) * slow + offsets[2 * frame // frames]
-            model.note(
+            probe = Probe(
                 element,
                 np.array([PROBE_SPACING]),
                 np.array([[3.0, y]]),
                 np.array([[1.0, 0.0]]),
                 np.ones(1),
-                (4.0 * frame, 0.0, float(2 * frame // frames)),
+                np.array([4.0 * frame, 0.0]),
+                2 * frame // frames,
             )
+            model.note(probe)
     assert elements * frames < CAPACITY
     return model.parts()
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mapfusion import RegionOfInterest
 from mapfusion.geometry import arc_length, chamfer_distance, clip_line, inverse_pose, resample, transform_points
 from mapfusion.level_lines import level_polygons
-from mapfusion.tidying import tidy
+from mapfusion.line_repair import repaired_rows
 from tests.mapfusion.simulation import pose
 
 coordinate = st.floats(-100, 100, width=32)
@@ -75,7 +75,7 @@ def test_the_outline_of_a_disc_is_a_circle(x, y, phase):
 def test_tidy_lines_do_not_cross_themselves(points):
     import shapely
 
-    rows = tidy(points)
+    rows = repaired_rows(points)
     assert (np.diff(rows) > 0).all()
     remaining = points[rows]
     assume(len(remaining) > 1 and arc_length(remaining)[-1] > 0)

@@ -228,7 +228,7 @@ def test_equal_track_ids_of_two_drives_are_two_tracks():
         for number in range(6):
             integrator.add(frame_map(lines, number=number, tracks=[7, 8]), "first")
         integrator.add(frame_map([[[-20, 0.83], [20, 0.83]]], number=6, tracks=[7]), second)
-        found[second] = [line.evidence.observations for line in integrator.lines.values()]
+        found[second] = [line.evidence.observations for line in integrator.state.lines.values()]
     assert found == {"first": [7, 6], "second": [6, 7]}
 
 

@@ -15,7 +15,7 @@ from mapfusion import ElementKind, IntegratorConfig, MapElement, MapIntegrator, 
 from mapfusion.ground import CameraSector, visible_ground
 from mapfusion.integrate.joining import join
 from mapfusion.integrate.views import ViewGrid
-from mapfusion.tidying import hairpins
+from mapfusion.line_repair import hairpins
 from tests.mapfusion.map_quality import dense, faults, nearest
 from tests.mapfusion.simulation import ROI, pose, town_drive
 from tests.mapfusion.test_integrator_properties import frame_map, integrate

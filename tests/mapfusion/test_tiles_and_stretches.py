@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapfusion.elements import ElementKind
 from mapfusion.geometry import arc_length
-from mapfusion.merge.tiles import Piece, Stitcher, cut_line, tiles_of
+from mapfusion.merge.tiles import MergedLine, Stitcher, cut_line, tiles_of
 from mapfusion.stretches import pair, sample_lines
 
 spots = st.tuples(st.floats(-300, 300), st.floats(-300, 300))
@@ -45,10 +45,8 @@ def test_stitching_gives_back_a_smooth_line(heading, length, x, y, turned):
     stitcher = Stitcher(sorted(cut))
     whole = []
     for tile in sorted(cut):
-        pieces = [
-            Piece(ElementKind.DIVIDER, *((p[::-1], np.c_[v, v][::-1]) if turned else (p, np.c_[v, v])), {0: 3}, 1, 2)
-            for p, v in cut[tile]
-        ]
+        rows = slice(None, None, -1) if turned else slice(None)
+        pieces = [MergedLine(ElementKind.DIVIDER, p[rows], np.c_[v, v][rows], {0: 3}, 1, 2) for p, v in cut[tile]]
         whole.extend(stitcher.add(tile, pieces))
     whole.extend(stitcher.rest())
     long = [piece for piece in whole if arc_length(piece.points)[-1] > 1.0]

@@ -13,14 +13,14 @@ from mapfusion.integrate.marks import Marks
 Float = NDArray[np.float64]
 
 INFORMATION, SEEN, SEEN_VIEW, OBSERVATIONS, SCATTER = range(5)
-"""Columns of :attr:`Curve.sums`."""
+"""Columns of :attr:`StationCurve.sums`."""
 
 PLACES, TRACKS = range(2)
-"""Columns of :attr:`Curve.marks`."""
+"""Columns of :attr:`StationCurve.marks`."""
 
 
 @dataclass
-class Curve:
+class StationCurve:
     """Stations along a line, about one spacing apart; arrays of equal length.
 
     Attributes:
@@ -37,7 +37,7 @@ class Curve:
     marks: Marks
 
     @classmethod
-    def of(cls, points: Float, information: Float, seen: Float, seen_view: Float) -> Curve:
+    def of(cls, points: Float, information: Float, seen: Float, seen_view: Float) -> StationCurve:
         """Return a curve of one observation whose place and track are not known."""
         count = len(points)
         sums = np.stack([information, seen, seen_view, np.ones(count), np.zeros(count)], axis=1)
@@ -61,22 +61,22 @@ class Curve:
         """``(n,) float64``, sum of the view weights of those sightings."""
         return self.sums[:, SEEN_VIEW]
 
-    def part(self, start: int, stop: int) -> Curve:
+    def part(self, start: int, stop: int) -> StationCurve:
         """Return stations ``start`` to ``stop`` (excluded)."""
-        return Curve(self.points[start:stop], self.sums[start:stop], self.marks[start:stop])
+        return StationCurve(self.points[start:stop], self.sums[start:stop], self.marks[start:stop])
 
-    def reversed(self) -> Curve:
+    def reversed(self) -> StationCurve:
         """Return the curve with its stations in the opposite order."""
-        return Curve(self.points[::-1], self.sums[::-1], self.marks[::-1])
+        return StationCurve(self.points[::-1], self.sums[::-1], self.marks[::-1])
 
-    def copy(self) -> Curve:
+    def copy(self) -> StationCurve:
         """Return a curve with arrays of its own."""
-        return Curve(self.points.copy(), self.sums.copy(), self.marks.copy())
+        return StationCurve(self.points.copy(), self.sums.copy(), self.marks.copy())
 
     @staticmethod
-    def join(parts: Sequence[Curve]) -> Curve:
+    def join(parts: Sequence[StationCurve]) -> StationCurve:
         """Put curves end to end."""
-        return Curve(
+        return StationCurve(
             np.concatenate([part.points for part in parts]),
             np.concatenate([part.sums for part in parts]),
             np.concatenate([part.marks for part in parts]),

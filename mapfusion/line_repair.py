@@ -38,7 +38,7 @@ def hairpins(points: Float) -> list[int]:
     return sorted(tips)
 
 
-def tidy(points: Float) -> Integer:
+def repaired_rows(points: Float) -> Integer:
     """Choose the vertices of a line that remain when spikes and loops are taken out.
 
     Args:

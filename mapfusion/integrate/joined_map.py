@@ -16,10 +16,8 @@ from mapfusion.integrate.views import ViewGrid
 
 Float = NDArray[np.float64]
 
-Piece = tuple[list[MapElement], Ends]
 
-
-class Assembly:
+class JoinedMap:
     """What :func:`mapfusion.integrate.joining.join` makes of all pieces, kept up to date.
 
     Which ends are linked depends on both of them and on what was looked at between them, so a change reaches no
@@ -27,7 +25,7 @@ class Assembly:
     """
 
     def __init__(self) -> None:
-        self._pieces: dict[int, Piece] = {}
+        self._pieces: dict[int, tuple[list[MapElement], Ends]] = {}
         self._linked: dict[int, set[int]] = {}
         self._tips = TileIndex()
         self._changed: set[int] = set()
@@ -98,5 +96,5 @@ class Assembly:
             self._joined.setdefault(owner[first], []).append(element)
 
 
-def _elements(pieces: list[Piece]) -> list[MapElement]:
+def _elements(pieces: list[tuple[list[MapElement], Ends]]) -> list[MapElement]:
     return [element for elements, _ in pieces for element in elements]
