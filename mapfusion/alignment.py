@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapfusion.arrays import Bool, Float, Integer, Rows
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.stretches import Samples, sample_lines
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Rows = NDArray[np.intp]
 
 TURNS = (0.0, 0.6, -0.6, 1.2, -1.2)
 """Where the search for the turn begins, degrees; all but the first only if that finds no good agreement."""
@@ -101,8 +97,8 @@ class Landmarks:
     """A map as samples with directions and kinds, and a tree over each kind."""
 
     samples: Samples
-    kinds: NDArray[np.int64]
-    trees: dict[int, tuple[NDArray[np.intp], cKDTree]]
+    kinds: Integer
+    trees: dict[int, tuple[Rows, cKDTree]]
 
 
 def landmarks(global_map: GlobalMap, config: AlignmentConfig | None = None) -> Landmarks:
@@ -206,9 +202,7 @@ def _refused(reason: str, overlap: float) -> Alignment:
     return Alignment(np.zeros(2), np.zeros(2), 0.0, np.zeros((3, 3)), overlap, 0.0, reason)
 
 
-def _nearest(
-    source: Landmarks, target: Landmarks, points: Float, reach: float
-) -> tuple[NDArray[np.int64], Float, Float]:
+def _nearest(source: Landmarks, target: Landmarks, points: Float, reach: float) -> tuple[Integer, Float, Float]:
     """Return for each point of the source, moved to ``points``, the nearest target sample of its kind.
 
     Returns:

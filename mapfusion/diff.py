@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from mapfusion.alignment import Alignment, align, landmarks
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
 from mapfusion.formats.geojson import DECIMALS
@@ -21,9 +21,6 @@ from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 
 class Change(StrEnum):

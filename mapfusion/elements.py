@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
+from mapfusion.arrays import Bool, Float, Integer
+
 Origins: TypeAlias = Mapping[str, tuple[int, ...]]
 """Names of drives or maps to the ids of the tracks in them."""
 
@@ -107,7 +107,7 @@ class FrameMap:
     def __len__(self) -> int:
         return len(self.polylines)
 
-    def select(self, mask: NDArray[np.bool_]) -> FrameMap:
+    def select(self, mask: Bool) -> FrameMap:
         """Return the elements where ``mask`` (``(n,) bool``) is true."""
         rows = np.flatnonzero(mask)
         return replace(

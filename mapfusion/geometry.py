@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import RegionOfInterest
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 UNIT_TOLERANCE = 1e-14
 """A squared quaternion length this close to 1 is 1."""

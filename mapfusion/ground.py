@@ -14,13 +14,11 @@ from functools import reduce
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Bool, Float
 from mapfusion.elements import FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import transform_points
 from mapfusion.georeference import Georeference, InvertibleGeoreference
-
-Float = NDArray[np.float64]
 
 SECTOR_STEP = np.radians(5.0)
 """Angle between the vertices of an arc, radians."""
@@ -198,7 +196,7 @@ def near_elements(elements: Iterable[MapElement]) -> shapely.Geometry:
     return shapely.simplify(closed, 0.5)
 
 
-def inside(ground: shapely.Geometry, points: Float) -> NDArray[np.bool_]:
+def inside(ground: shapely.Geometry, points: Float) -> Bool:
     """Return which of ``(n, 2)`` points lie on the ground."""
     shapely.prepare(ground)
     return np.asarray(shapely.contains_xy(ground, points[:, 0], points[:, 1]))

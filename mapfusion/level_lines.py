@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float, Rows
 
 # Corners of a block: bit 1 at (i, j), 2 at (i + 1, j), 4 at (i + 1, j + 1), 8 at (i, j + 1).
 # Sides: 0 between bits 1 and 2, 1 between 2 and 4, 2 between 4 and 8, 3 between 8 and 1.
@@ -55,7 +54,7 @@ def level_polygons(values: Float, level: float) -> list[shapely.Polygon]:
     return sorted(outlines, key=lambda polygon: -polygon.area)
 
 
-def _crossing(grid: Float, row: NDArray[np.intp], column: NDArray[np.intp], side: int) -> Float:
+def _crossing(grid: Float, row: Rows, column: Rows, side: int) -> Float:
     """Return where the level crosses one side of each block, ``(n, 2)``, computed alike from both neighbours."""
     if side in (0, 2):
         column = column + (side == 2)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
+from mapfusion.arrays import Float, Integer
 
 SPIKE_COSINE = np.cos(np.radians(120.0))
 """A line that turns by more than this between two stations folds back on itself."""

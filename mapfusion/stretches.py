@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.geometry import arc_length, tangents
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 NEIGHBOURS = 32
 """Samples that are looked at around each; enough for four lines side by side at the usual spacing."""
@@ -90,7 +87,7 @@ class Pairing:
     offset: Float
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def found(self) -> Bool:
         """``(n,)``, which samples have a partner."""
         return np.asarray(self.partner >= 0)
 

@@ -10,16 +10,14 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
 from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
 from mapfusion.formats.lanelet2 import read_lanelet, write_lanelet
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.georeference import Georeference, InvertibleGeoreference
-
-Float = NDArray[np.float64]
 
 SUFFIXES = {
     ".geojson": "GeoJSON",

@@ -14,14 +14,12 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.georeference import Georeference, InvertibleGeoreference
-
-Float = NDArray[np.float64]
 
 DECIMALS = 10
 """Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""

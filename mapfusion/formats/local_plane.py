@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 WGS84_SEMI_MAJOR_AXIS = 6_378_137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import FrameMap
 from mapfusion.geometry import tangents
 from mapfusion.integrate.config import IntegratorConfig
@@ -17,9 +17,6 @@ from mapfusion.integrate.fused_line import FusedLine
 from mapfusion.integrate.fused_ring import FusedRing, RingSighting, overlap, room_of, sight
 from mapfusion.integrate.matching import Correspondence, DirectedPoints, MatchLimits, correspond
 from mapfusion.integrate.observations import Observation
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 TRACK_BONUS = 0.2
 """Bonus of an element into which the track was fused before, on the scale of squared distance over its gate."""

@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 from scipy.special import expit
 
+from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
@@ -21,8 +21,6 @@ from mapfusion.integrate.station_curve import StationCurve
 from mapfusion.integrate.uncertainty import line_deviations, ring_deviations
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import closes, hairpins, repaired_rows
-
-Float = NDArray[np.float64]
 
 LOG_ODDS_LIMIT = 6.0
 """More evidence than this does not make a map surer."""
@@ -113,14 +111,14 @@ def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
     return np.asarray(solved + origin, dtype=np.float64)
 
 
-def _supported(odds: Float, weak: float) -> NDArray[np.bool_]:
+def _supported(odds: Float, weak: float) -> Bool:
     """Return where a line exists: more likely than not, or weaker but in one piece with where it does (hysteresis)."""
     strong, possible = odds > 0.0, odds > weak
     piece = np.cumsum(np.diff(possible, prepend=False))
     return np.asarray(possible & np.isin(piece, piece[strong]))
 
 
-def _stretches(alive: NDArray[np.bool_], gap: int) -> list[tuple[int, int]]:
+def _stretches(alive: Bool, gap: int) -> list[tuple[int, int]]:
     """Return start and stop (excluded) of the runs of True, with gaps of up to ``gap`` bridged."""
     rows = np.flatnonzero(alive)
     if not len(rows):
@@ -137,7 +135,7 @@ def _unfolded(points: Float, start: int, stop: int) -> list[tuple[int, int]]:
     return [(a, min(b + 1, stop)) for a, b in pairwise(edges)]
 
 
-def _simplify(points: Float, tolerance: float) -> tuple[Float, NDArray[np.int64]]:
+def _simplify(points: Float, tolerance: float) -> tuple[Float, Integer]:
     """Simplify a line; returns its points and which of the given ones they are."""
     simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), tolerance))
     lookup = {point: row for row, point in enumerate(map(tuple, points.tolist()))}

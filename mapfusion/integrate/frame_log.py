@@ -6,10 +6,7 @@ import math
 from bisect import bisect_left
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 STANDSTILL = 3.0
 """Positions this close never count as a jump, metres."""

@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind
 from mapfusion.geometry import tangents
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.matching import Correspondence, DirectedPoints, MatchLimits, correspond
 from mapfusion.integrate.station_curve import INFORMATION, SCATTER, StationCurve
-
-Float = NDArray[np.float64]
 
 BLEND_LENGTH = 10.0
 """Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
@@ -87,7 +85,7 @@ def fuse(line: FusedLine, new: StationCurve, match: Correspondence) -> list[Stat
     return leftovers
 
 
-def _average(base: StationCurve, new: StationCurve, match: Correspondence, vertex: NDArray[np.int64]) -> Float:
+def _average(base: StationCurve, new: StationCurve, match: Correspondence, vertex: Integer) -> Float:
     """Move stations to the weighted mean, in place; returns the new curve's share in it, ``(n,)``."""
     station = match.station
     added = new.sums.take(vertex, axis=0)

@@ -8,16 +8,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Bool, Float, Integer, Marks
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose, transform_points
 from mapfusion.integrate.evidence import Evidence
-from mapfusion.integrate.marks import Marks
 from mapfusion.integrate.observations import Observation
 from mapfusion.level_lines import level_polygons
 
-Float = NDArray[np.float64]
 Grid = NDArray[np.float32]
-Integer = NDArray[np.int64]
 Window = tuple[slice, slice]
 
 TRUNCATION = 1.5
@@ -115,7 +113,7 @@ class FusedRing:
         return shapely.Polygon((points + self.corner + 0.5) * cell)
 
 
-def _straightened(ring: Float, loose: NDArray[np.bool_]) -> Float:
+def _straightened(ring: Float, loose: Bool) -> Float:
     """Take the steps of the lattice out of the stretches of a closed ring ``(n + 1, 2)`` whose place means nothing."""
     if not loose.any() or loose.all():
         return ring
@@ -147,8 +145,8 @@ class RingSighting:
     observation: Observation
     corner: Integer
     distance: Grid
-    visible: NDArray[np.bool_]
-    clear: NDArray[np.bool_]
+    visible: Bool
+    clear: Bool
 
     @property
     def stop(self) -> Integer:
@@ -205,7 +203,7 @@ def sight(
     return RingSighting(observation, low, distance, visible, clear)
 
 
-def _signed_distance(x: Float, y: Float, ring: Float, counts: NDArray[np.bool_]) -> Grid:
+def _signed_distance(x: Float, y: Float, ring: Float, counts: Bool) -> Grid:
     """Return the truncated signed distance from cells to a ring; edges that do not count bound, but are not near.
 
     Args:

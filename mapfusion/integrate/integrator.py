@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
 from mapfusion.geometry import rigid_pose_problem
 from mapfusion.ground import ground_problem
@@ -33,8 +33,6 @@ from mapfusion.integrate.station_curve import StationCurve
 from mapfusion.integrate.tile_index import TileIndex
 from mapfusion.integrate.uncertainty import PRIOR_SHARES, PROBE_SPACING, Probe
 from mapfusion.integrate.views import clearly_visible
-
-Float = NDArray[np.float64]
 
 STALE = 0.1
 """Relative change of the learnt error model from which on the uncertainty of the whole map is computed anew."""

@@ -6,15 +6,13 @@ from collections.abc import Iterable
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import MapElement
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.joining import Ends, all_ends, chained, ends_of, links_between
 from mapfusion.integrate.tile_index import TileIndex
 from mapfusion.integrate.views import ViewGrid
-
-Float = NDArray[np.float64]
 
 
 class JoinedMap:

@@ -11,18 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.chains import LineEnd, chain_lines
 from mapfusion.elements import MapElement, united
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import repaired_rows
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 DIRECTION_LENGTH = 4.0
 """The direction of an end is that of the last so many metres."""
@@ -99,20 +96,6 @@ def all_ends(pieces: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
     )
     element, end, kind, tip, outward = columns
     return Ends(element + np.repeat(before[:-1], counts), end, kind, tip, outward)
-
-
-def join(elements: Sequence[MapElement], views: ViewGrid, config: IntegratorConfig) -> list[MapElement]:
-    """Join the lines that go on in each other; crossings and closed lines stay as they are.
-
-    Args:
-        elements: of one map, metres.
-        views: where the car has looked.
-        config: how far apart, and how well in line, ends must be.
-
-    Returns:
-        The elements, in the order of the first piece of each.
-    """
-    return [element for _, element in chained(elements, links_between(elements, ends_of(elements), views, config))]
 
 
 def _direction(points: Float, end: int) -> Float:

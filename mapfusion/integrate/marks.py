@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Marks: TypeAlias = NDArray[np.uint64]
-"""Bit sets, one an entry."""
+from mapfusion.arrays import Float, Marks
 
 PLACE = 5.0
 """Side of the square cells that stand for the place from which the car saw a station, metres."""

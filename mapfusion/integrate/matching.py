@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
+from mapfusion.arrays import Bool, Float, Integer, Rows
 
 
 class DirectedPoints(NamedTuple):
@@ -24,7 +22,7 @@ class DirectedPoints(NamedTuple):
     points: Float
     directions: Float
 
-    def rows(self, rows: NDArray[np.intp]) -> DirectedPoints:
+    def rows(self, rows: Rows) -> DirectedPoints:
         """Return some of the points."""
         return DirectedPoints(self.points.take(rows, axis=0), self.directions.take(rows, axis=0))
 
@@ -59,9 +57,9 @@ class Correspondence:
     vertex: Integer
     offset: Float
     distance: Float
-    same_way: NDArray[np.bool_]
+    same_way: Bool
 
-    def rows(self, rows: NDArray[np.intp]) -> Correspondence:
+    def rows(self, rows: Rows) -> Correspondence:
         """Return some of the stations."""
         return Correspondence(
             self.station.take(rows),
@@ -160,9 +158,9 @@ class _Feet(NamedTuple):
     vertex: Integer
     offset: Float
     distance: Float
-    beside: NDArray[np.bool_]
+    beside: Bool
 
-    def where(self, chosen: NDArray[np.bool_], other: _Feet) -> _Feet:
+    def where(self, chosen: Bool, other: _Feet) -> _Feet:
         """Return these feet where ``chosen`` is true, else the other ones."""
         return _Feet(
             np.where(chosen, self.vertex, other.vertex),
@@ -172,7 +170,7 @@ class _Feet(NamedTuple):
         )
 
 
-def _feet(pairs: _Pairs, square: Float, ahead: NDArray[np.bool_], limits: MatchLimits) -> _Feet:
+def _feet(pairs: _Pairs, square: Float, ahead: Bool, limits: MatchLimits) -> _Feet:
     """Find the foot of each station.
 
     Args:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap
 from mapfusion.geometry import clip_line, tangents, transform_points
 from mapfusion.integrate.config import IntegratorConfig
@@ -17,8 +17,6 @@ from mapfusion.integrate.evidence import Track
 from mapfusion.integrate.marks import place_mark, track_mark
 from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES, SEEN, SEEN_VIEW, TRACKS, StationCurve
 from mapfusion.integrate.views import view_weight
-
-Float = NDArray[np.float64]
 
 SURE_SCORE = 0.5
 """A detection with this score is a whole sighting."""

@@ -6,11 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mapfusion.integrate.marks import Marks
-
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float, Marks
 
 INFORMATION, SEEN, SEEN_VIEW, OBSERVATIONS, SCATTER = range(5)
 """Columns of :attr:`StationCurve.sums`."""
@@ -35,13 +32,6 @@ class StationCurve:
     points: Float
     sums: Float
     marks: Marks
-
-    @classmethod
-    def of(cls, points: Float, information: Float, seen: Float, seen_view: Float) -> StationCurve:
-        """Return a curve of one observation whose place and track are not known."""
-        count = len(points)
-        sums = np.stack([information, seen, seen_view, np.ones(count), np.zeros(count)], axis=1)
-        return cls(points, sums, np.ones((count, 2), dtype=np.uint64))
 
     def __len__(self) -> int:
         return len(self.points)

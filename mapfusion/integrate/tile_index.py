@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float, Integer
 
 TILE_SIZE = 32.0
 """Side of a tile, metres."""
 
 
-def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _key(cells: Integer) -> Integer:
     return (cells[..., 0] << 32) + cells[..., 1]
 
 

@@ -16,17 +16,14 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import nnls
 from scipy.special import expit
 
+from mapfusion.arrays import Float, Integer, Marks, Rows
 from mapfusion.integrate.fused_ring import FusedRing
-from mapfusion.integrate.marks import PLACE, Marks, distinct
+from mapfusion.integrate.marks import PLACE, distinct
 from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, StationCurve
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 LASTING = np.array([10.0, 30.0])
 """Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
@@ -119,7 +116,7 @@ class _Passages(NamedTuple):
         )
         return passages.rows(np.lexsort((passages.station, passages.element)))
 
-    def rows(self, rows: NDArray[np.intp]) -> _Passages:
+    def rows(self, rows: Rows) -> _Passages:
         return _Passages._make(column[rows] for column in self)
 
 
@@ -151,7 +148,7 @@ class _Differences(NamedTuple):
         return cls(other.astype(np.int64), lag, square, contrast)
 
 
-def _first_of_equal(group: Integer, contrast: Float) -> NDArray[np.intp]:
+def _first_of_equal(group: Integer, contrast: Float) -> Rows:
     """Return one row of each set of rows that are equal in both columns ``(n,)``, at least one row."""
     order = np.lexsort((contrast, group))
     new = (np.diff(group[order]) != 0) | (np.diff(contrast[order]) != 0.0)

@@ -8,11 +8,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import FrameMap, RegionOfInterest
 from mapfusion.ground import ground_within
 from mapfusion.integrate.config import IntegratorConfig
 
-Float = NDArray[np.float64]
 TileKey: TypeAlias = tuple[int, int]
 
 TILE_CELLS = 64

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import logit
 
+from mapfusion.arrays import Float
 from mapfusion.elements import MapElement
 from mapfusion.ground import inside
 from mapfusion.merge.config import MergeConfig
-
-Float = NDArray[np.float64]
 
 VIEW_LENGTH = 60.0
 """A car sees about this much of a road at a time, metres."""

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
 from mapfusion.alignment import Alignment, move
-
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 PRIOR = np.array([1.0, 1.0, np.radians(0.5)])
 """Standard deviation of a drive's own pose: metres, metres, radians. It holds each group of maps at its mean."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.chains import LineEnd, chain_lines
 from mapfusion.elements import ElementKind, MapElement, united
 from mapfusion.geometry import arc_length, tangents
@@ -22,10 +22,6 @@ from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
 from mapfusion.merge.tiles import MergedLine
 from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 SPACING = 1.0
 """Distance between the stations of a reference, metres; other maps are sampled twice as densely."""

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.special import expit
 
 from mapfusion.alignment import Alignment, Landmarks, align, landmarks
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
@@ -31,7 +31,6 @@ from mapfusion.merge.report import MapStatus, MergeReport, short_names
 from mapfusion.merge.rings import fuse_rings
 from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, cut_line, tiles_of
 
-Float = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 """Called as ``progress(done, in all, what)``."""
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.special import expit
 
+from mapfusion.arrays import Float
 from mapfusion.elements import MapElement, united
 from mapfusion.level_lines import level_polygons
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
-
-Float = NDArray[np.float64]
 
 CELL = 0.25
 """Side of a grid cell, metres."""

@@ -6,11 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, Origins, united
-
-Float = NDArray[np.float64]
 
 SEAM = 1.0
 """Ends on the common side of two tiles that lie this close are one place, metres."""

@@ -54,10 +54,9 @@ def filled(size: int) -> MapIntegrator:
     for number in range(size):
         row, column = divmod(number, side)
         points = np.stack([x + 50.0 * (column - side // 2), np.full(41, 8.0 * (row - side // 2) + 100.0)], axis=1)
-        ones = np.ones(41)
-        line = FusedLine(
-            ElementKind.DIVIDER, StationCurve.of(points, 50 * ones, 5 * ones, 5 * ones), Evidence(0, 1, 5, {(0, 1): 5})
-        )
+        sums = np.tile([50.0, 5.0, 5.0, 1.0, 0.0], (41, 1))
+        curve = StationCurve(points, sums, np.ones((41, 2), dtype=np.uint64))
+        line = FusedLine(ElementKind.DIVIDER, curve, Evidence(0, 1, 5, {(0, 1): 5}))
         integrator.put_line(number, line)
     integrator.state.next_id = size
     return integrator

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mapfusion import ElementKind, IntegratorConfig, MapElement, MapIntegrator, RegionOfInterest
 from mapfusion.ground import CameraSector, visible_ground
-from mapfusion.integrate.joining import join
+from mapfusion.integrate.joined_map import JoinedMap
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import hairpins
 from tests.mapfusion.map_quality import dense, faults, nearest
@@ -33,7 +33,10 @@ def joined(*elements, looked: int = 0) -> list[MapElement]:
     views = ViewGrid(CONFIG)
     for _ in range(looked):
         views.add(np.eye(4), RegionOfInterest())
-    return join(elements, views, CONFIG)
+    joined_map = JoinedMap()
+    for number, element in enumerate(elements):
+        joined_map.put(number, [element])
+    return list(joined_map.elements(views, CONFIG))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
