@@ -1,4 +1,4 @@
-"""Where one drive's map must move to lie on another's: trimmed point-to-line ICP, refused where it is not certain."""
+"""Alignment of two maps of one place by trimmed point-to-line ICP, refused where it is not certain."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.stretches import Samples, sample_lines
 
 TURNS = (0.0, 0.6, -0.6, 1.2, -1.2)
-"""Where the search for the turn begins, degrees; all but the first only if that finds no good agreement."""
+"""Turns from which the search starts, degrees; all but the first only if that one finds no good agreement."""
 
 SEARCH_SAMPLES = 150
-"""Samples that take part in the search on the grid."""
+"""Number of samples that take part in the search on the grid."""
 
 RIVAL_DISTANCE = 2.0
-"""A shift this far from the best one is another answer, not the same one less exactly, metres."""
+"""Shifts this far from the best one are another answer, metres."""
 
 
 @dataclass(frozen=True)
 class AlignmentConfig:
-    """When a correction is believed.
+    """Conditions under which an alignment is believed.
 
     Attributes:
         spacing: distance between the samples of a line, metres.
@@ -54,7 +54,7 @@ class AlignmentConfig:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The rigid motion of the plane that puts one map on another.
+    """Rigid motion of the plane that puts one map on another.
 
     Attributes:
         centre: ``(2,)``, metres; the motion is ``p -> centre + R(turn) (p - centre) + shift``.
@@ -94,7 +94,7 @@ def move(points: Float, centre: Float, shift: Float, turn: float) -> Float:
 
 @dataclass(frozen=True)
 class Landmarks:
-    """A map as samples with directions and kinds, and a tree over each kind."""
+    """Samples of a map with directions and kinds, and a tree over each kind."""
 
     samples: Samples
     kinds: Integer
@@ -179,7 +179,7 @@ def _elsewhere(config: AlignmentConfig) -> Float:
 
 
 def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentConfig) -> tuple[str, bool]:
-    """Say why an alignment is not to be believed, or nothing; and whether the maps contradict each other."""
+    """Return why an alignment is not believed (empty if it is), and whether the maps contradict each other."""
     if result.overlap < config.min_overlap:
         return f"only {result.overlap:.0f} m of lines agree", agreement < config.min_agreement
     if agreement < config.min_agreement:
@@ -224,7 +224,7 @@ def _nearest(source: Landmarks, target: Landmarks, points: Float, reach: float) 
 
 
 def _score(source: Landmarks, target: Landmarks, common: Rows, motion: Alignment, shifts: Float) -> Float:
-    """Say how well maps agree under a motion and each of some shifts after it, ``(n,)``; larger is better."""
+    """Return how well maps agree under a motion and each of some shifts after it, ``(n,)``; larger is better."""
     thin = common[:: max(1, len(common) // SEARCH_SAMPLES)]
     moved = motion.apply(source.samples.points[thin])[None, :, :] + shifts[:, None, :]
     score = np.zeros(len(shifts))

@@ -1,4 +1,4 @@
-"""What changed between two maps of the same place: stretch by stretch, however the lines are cut into elements."""
+"""Differences between two maps of one place, stretch by stretch, however the lines are cut into elements."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from mapfusion.formats.geojson import DECIMALS
 from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
-from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
+from mapfusion.stretches import Pairing, Samples, equal_runs, pair, sample_lines, settle
 
 
 class Change(StrEnum):
-    """What became of a stretch."""
+    """Change of a stretch of a line, or of a crossing."""
 
     ADDED = "added"
     REMOVED = "removed"
@@ -36,12 +36,12 @@ class Change(StrEnum):
 ORDER = tuple(Change)
 
 SHORTEST_ADDED = 2.0
-"""Crumbs of a line that has been cut into pieces can find their place taken; shorter ones are no news, metres."""
+"""Shorter stretches do not count as added, metres: where lines are cut otherwise, crumbs find no partner."""
 
 
 @dataclass(frozen=True)
 class DiffConfig:
-    """What counts as a change.
+    """Limits of what counts as a change.
 
     Attributes:
         tolerance: a stretch that lies within this distance of where it was is unchanged, metres.
@@ -68,11 +68,11 @@ class DiffConfig:
 
 @dataclass(frozen=True)
 class Difference:
-    """One stretch of a line, or one crossing.
+    """Stretch of a line, or crossing, with its change.
 
     Attributes:
-        change: what became of it.
-        kind: what it is.
+        change: of this stretch.
+        kind: of the element.
         points: ``(n, 2)`` metres; of the new map for what was added or moved, of the old map otherwise.
         length: metres.
         moved_by: median distance between old and new, metres; NaN where there is no counterpart.
@@ -89,7 +89,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class MapDiff:
-    """The differences between two maps.
+    """Differences between two maps.
 
     Attributes:
         differences: by change and kind, in the order of the maps.
@@ -125,8 +125,8 @@ def diff_maps(
 ) -> MapDiff:
     """Compare two maps in one metric frame.
 
-    Lines are compared sample by sample along their length; a stretch of the new map answers for one stretch of the
-    old one only, so that a double line that became a single one shows. What lies farther off than
+    Lines are compared sample by sample along their length; a stretch of the new map is the partner of one
+    stretch of the old one only, so that a double line that became a single one shows. What lies farther off than
     :attr:`DiffConfig.tolerance` has moved, unless that is within what the maps state of their own uncertainty. What
     the old map has and the new one lacks is removed where the new map's drive has looked
     (:func:`mapfusion.ground.coverage`), else unobserved.
@@ -211,7 +211,7 @@ def _compare_lines(
     states[forward.found] = ORDER.index(Change.MOVED)
     states[near] = ORDER.index(Change.UNCHANGED)
     found = _stretches(kind, old, before, forward, states, config)
-    # of the new map only what nothing in the old one answers for
+    # of the new map only stretches without a partner in the old one
     states = np.where(backward.found, -1, ORDER.index(Change.ADDED))
     return found + _stretches(kind, new, after, backward, states, config)
 
@@ -239,7 +239,7 @@ def _stretches(
     for line, element in enumerate(elements):
         first, stop = samples.bounds(line)
         steady = settle(states[first:stop], round(config.min_length / config.spacing))
-        for start, end, state in runs(steady):
+        for start, end, state in equal_runs(steady):
             if state < 0:
                 continue
             change = ORDER[state]

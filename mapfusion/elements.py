@@ -1,4 +1,4 @@
-"""The nouns of a vector map: kinds, regions, the map of one instant and the map of a whole drive."""
+"""Nouns of a vector map: kinds, regions, the map of one frame and the map of a whole drive."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from mapfusion.arrays import Bool, Float, Integer
 
 Origins: TypeAlias = Mapping[str, tuple[int, ...]]
-"""Names of drives or maps to the ids of the tracks in them."""
+"""Ids of tracks by name of the drive or map that they belong to."""
 
 
 class ElementKind(IntEnum):
-    """What a polyline stands for; the numbers are the class ids of nuScenes and Argoverse 2 benchmarks."""
+    """Kind of a map element; the numbers are the class ids of the nuScenes and Argoverse 2 benchmarks."""
 
     PED_CROSSING = 0
     DIVIDER = 1
@@ -36,7 +36,7 @@ class ElementKind(IntEnum):
 
 @dataclass(frozen=True)
 class RegionOfInterest:
-    """The rectangle around the car that is mapped at one instant.
+    """Rectangle around the car that is mapped in one frame.
 
     Attributes:
         length: extent along x (forward), metres; x lies in ``[-length / 2, length / 2]``.
@@ -61,7 +61,7 @@ class RegionOfInterest:
 
 @dataclass(frozen=True)
 class FrameMap:
-    """What the mapper saw at one instant: polylines in the ego frame, as arrays of equal length.
+    """Map of one frame: polylines in the ego frame, as arrays of equal length.
 
     Sequences become arrays and an integer of any type a plain one.
 
@@ -80,8 +80,7 @@ class FrameMap:
             y, column 0 the smallest x. ``None`` if the mapper makes none.
         history_masks: ``(n, rows, columns) float32``, raster memory of each element, same grid convention.
         visible: rings ``(k, 2) float64``, metres, ego frame, around the ground that could be seen at that instant; a
-            ring within another is a hole. Nothing seen where nothing can be seen is no evidence (see
-            :func:`mapfusion.ground.visible_ground`). ``None``: all of the ROI.
+            ring within another is a hole; see :func:`mapfusion.ground.visible_ground`. ``None``: all of the ROI.
     """
 
     timestamp: int
@@ -128,10 +127,10 @@ class FrameMap:
 
 @dataclass(frozen=True)
 class MapElement:
-    """One element of a global map.
+    """Element of a global map.
 
     Attributes:
-        kind: what it is.
+        kind: divider, boundary or crossing.
         points: ``(n, 2) float64``, metres, global frame; a crossing is a closed ring.
         confidence: in ``[0, 1]``.
         observations: number of frames that saw it.
@@ -180,8 +179,8 @@ class MapElement:
         )
 
 
-def united(several: Iterable[Origins]) -> dict[str, tuple[int, ...]]:
-    """Return the sources and tracks of all of several elements."""
+def united_origins(several: Iterable[Origins]) -> dict[str, tuple[int, ...]]:
+    """Return the union of the sources and tracks of several elements."""
     found: dict[str, set[int]] = {}
     for origins in several:
         for name, tracks in origins.items():
@@ -191,7 +190,7 @@ def united(several: Iterable[Origins]) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class GlobalMap:
-    """The map of a whole drive: elements in one metric global frame, and where they came from."""
+    """Map of one or more drives: elements in one metric global frame, and their provenance."""
 
     elements: tuple[MapElement, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)

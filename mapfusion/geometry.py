@@ -13,7 +13,7 @@ UNIT_TOLERANCE = 1e-14
 
 
 def arc_length(points: Float) -> Float:
-    """Distance along the line at each vertex.
+    """Return the distance along a line at each vertex.
 
     Args:
         points: ``(n, 2)``, metres.
@@ -26,7 +26,7 @@ def arc_length(points: Float) -> Float:
 
 
 def resample(points: Float, count: int) -> Float:
-    """Place ``count`` points at equal distances along the line, both ends included.
+    """Return ``count`` points at equal distances along a line, both ends included.
 
     Args:
         points: ``(n, 2)``, ``n >= 1``; a line without length repeats its first point.
@@ -154,7 +154,7 @@ def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
 
 
 def chamfer_distance(first: Float, second: Float) -> float:
-    """Mean of the two directed mean nearest-point distances, metres (as in the chamfer AP of the field).
+    """Return the mean of the two directed mean nearest-point distances, metres (as in the chamfer AP of the field).
 
     Args:
         first, second: ``(n, 2)`` and ``(m, 2)`` point sets, usually densely resampled lines.

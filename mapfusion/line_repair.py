@@ -1,4 +1,4 @@
-"""Lines as a user expects them: no spikes, no loops, closed where they come back to their start."""
+"""Repair of lines: spikes and loops taken out, hairpins found, ends closed."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import shapely
 from mapfusion.arrays import Float, Integer
 
 SPIKE_COSINE = np.cos(np.radians(120.0))
-"""A line that turns by more than this between two stations folds back on itself."""
+"""Cosine of the turn between two stations from which on a line folds back on itself."""
 
 HAIRPIN = 3
-"""A line that still runs back so many stations past a turn is no spike."""
+"""Number of stations past a turn for which a line must run back to be a hairpin, not a spike."""
 
 CLOSING_GAP = 2.0
-"""Ends of one line this close, running into each other, are one place, metres."""
+"""Distance up to which the ends of one line that run into each other are one place, metres."""
 
 
 def hairpins(points: Float) -> list[int]:
@@ -37,7 +37,7 @@ def hairpins(points: Float) -> list[int]:
 
 
 def repaired_rows(points: Float) -> Integer:
-    """Choose the vertices of a line that remain when spikes and loops are taken out.
+    """Return the vertices of a line that remain when spikes and loops are taken out.
 
     Args:
         points: ``(n, 2)``, metres.

@@ -1,4 +1,4 @@
-"""Which stretch of which line of one map is which stretch of another's, however either is cut into elements."""
+"""Pairing of the lines of two finished maps, stretch by stretch (used by diff and merge)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.geometry import arc_length, tangents
 
 NEIGHBOURS = 32
-"""Samples that are looked at around each; enough for four lines side by side at the usual spacing."""
+"""Number of samples looked at around each; enough for four lines side by side at the usual spacing."""
 
 SHORT_STRETCH = 1.0
-"""Metres of common length at which the mean distance counts double: short ones must lie closer to win."""
+"""Common length at which the mean distance counts double, metres: short stretches must lie closer to win."""
 
 
 LEAST_DISTANCE = 0.05
-"""Lines closer than this are as close as can be told, metres; between those, the longer stretch wins."""
+"""Mean distance below which lines count as equally close, metres; between those, the longer stretch wins."""
 
 
 SEAM_SAMPLES = 2
-"""Where one line ends and the next begins, both may answer for this many samples."""
+"""Number of samples that two lines may share where one ends and the other begins."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def sample_lines(lines: Sequence[Float], spacing: float) -> Samples:
 
 @dataclass(frozen=True)
 class Pairing:
-    """For each sample of a first set its partner in a second.
+    """Partner in a second set for each sample of a first.
 
     Attributes:
         partner: ``(n,) int64``, row of the second set, -1 for none.
@@ -168,7 +168,7 @@ def _serve(
         owner[others[free]] = line
 
 
-def runs(values: Integer) -> list[tuple[int, int, int]]:
+def equal_runs(values: Integer) -> list[tuple[int, int, int]]:
     """Return ``(start, stop, value)`` of the runs of equal values."""
     if not len(values):
         return []
@@ -179,13 +179,13 @@ def runs(values: Integer) -> list[tuple[int, int, int]]:
 
 
 def settle(states: Integer, shortest: int) -> Integer:
-    """Give runs of fewer than ``shortest`` samples to the longer of their neighbours, the shortest run first.
+    """Return states whose runs of fewer than ``shortest`` samples took the state of their longer neighbour.
 
-    A line that is shorter than that as a whole keeps its most frequent state.
+    The shortest run goes first. A line that is shorter than that as a whole keeps its most frequent state.
     """
     states = states.copy()
     while True:
-        found = runs(states)
+        found = equal_runs(states)
         short = [run for run in found if run[1] - run[0] < shortest]
         if not short or len(found) == 1:
             return states

@@ -1,1 +1,1 @@
-"""Map files: one file per format."""
+"""Map files, one module per format."""

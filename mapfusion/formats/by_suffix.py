@@ -1,4 +1,4 @@
-"""Maps to and from files; the format is chosen by the name's ending."""
+"""Reading and writing of map files; the ending of the name chooses the format."""
 
 from __future__ import annotations
 
@@ -26,14 +26,18 @@ SUFFIXES = {
     ".fgb": "FlatGeobuf",
     ".osm": "Lanelet2",
 }
-"""Endings of the files that hold maps, and what each is."""
+"""Endings of the files that hold maps, and the format of each."""
+
+_WRITERS = {"GeoPackage": write_geodatabase, "FlatGeobuf": write_geodatabase, "Lanelet2": write_lanelet}
+_READERS = {"GeoPackage": read_geodatabase, "FlatGeobuf": read_geodatabase, "Lanelet2": read_lanelet}
 
 
-def check_suffix(path: Path) -> None:
-    """Raise ValueError for a name whose ending stands for no format."""
+def check_suffix(path: Path) -> str:
+    """Return the format that the ending of a name stands for; raises ValueError for other endings."""
     if path.suffix.lower() not in SUFFIXES:
         endings = ", ".join(f"{suffix} ({name})" for suffix, name in SUFFIXES.items())
         raise ValueError(f"{path}: the ending '{path.suffix}' stands for no map format; use one of {endings}")
+    return SUFFIXES[path.suffix.lower()]
 
 
 def write_map(
@@ -54,14 +58,7 @@ def write_map(
         ValueError: an ending that stands for no format, or coordinates not on the globe.
         OSError: the file cannot be written.
     """
-    check_suffix(path)
-    match SUFFIXES[path.suffix.lower()]:
-        case "GeoPackage" | "FlatGeobuf":
-            write_geodatabase(global_map, path, georeference, provenance)
-        case "Lanelet2":
-            write_lanelet(global_map, path, georeference, provenance)
-        case _:
-            write_geojson(global_map, path, georeference, provenance)
+    _WRITERS.get(check_suffix(path), write_geojson)(global_map, path, georeference, provenance)
 
 
 class MapWriter:
@@ -79,11 +76,9 @@ class MapWriter:
     """
 
     def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
-        check_suffix(path)
         self._path, self._georeference, self._provenance = path, georeference, provenance
-        self._stream = (
-            GeoJsonWriter(path, georeference, provenance) if SUFFIXES[path.suffix.lower()] == "GeoJSON" else None
-        )
+        streams = check_suffix(path) == "GeoJSON"
+        self._stream = GeoJsonWriter(path, georeference, provenance) if streams else None
         self._elements: list[MapElement] = []
 
     def __enter__(self) -> Self:
@@ -118,14 +113,7 @@ def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> 
         ValueError: an ending that stands for no format, or a file that is not as it should be.
         OSError: the file cannot be read.
     """
-    check_suffix(path)
-    match SUFFIXES[path.suffix.lower()]:
-        case "GeoPackage" | "FlatGeobuf":
-            return read_geodatabase(path, georeference)
-        case "Lanelet2":
-            return read_lanelet(path, georeference)
-        case _:
-            return read_geojson(path, georeference)
+    return _READERS.get(check_suffix(path), read_geojson)(path, georeference)
 
 
 def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
@@ -148,8 +136,7 @@ def read_box(path: Path) -> Float | None:
     Raises:
         ValueError, OSError: as :func:`read_map`.
     """
-    check_suffix(path)
-    match SUFFIXES[path.suffix.lower()]:
+    match check_suffix(path):
         case "GeoPackage" | "FlatGeobuf":
             box = geodatabase_box(path)
         case "Lanelet2":
@@ -169,7 +156,7 @@ def read_box(path: Path) -> Float | None:
 
 
 def _box_of_points(path: Path) -> list[float] | None:
-    """The bounds of a file that does not begin with them."""
+    """Return the bounds of a file that does not begin with them."""
     elements = read_map(path, _Degrees()).elements
     if not elements:
         return None
@@ -178,7 +165,7 @@ def _box_of_points(path: Path) -> list[float] | None:
 
 
 class _Degrees:
-    """Leaves longitude and latitude as they are."""
+    """Georeference that leaves longitude and latitude as they are."""
 
     name = "degrees"
 

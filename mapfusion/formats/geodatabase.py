@@ -1,4 +1,4 @@
-"""GeoPackage and FlatGeobuf through pyogrio (GDAL): the records of GeoJSON as columns.
+"""GeoPackage and FlatGeobuf files, through pyogrio (GDAL), with the properties of GeoJSON as columns.
 
 A GeoPackage has one layer of lines and one of crossings, because geographic information systems expect one type of
 geometry in a layer; a FlatGeobuf file has a single layer of both. Lists (``track_ids``, ``deviation_m`` and the

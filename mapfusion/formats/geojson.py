@@ -1,4 +1,4 @@
-"""RFC 7946 GeoJSON: one feature per element, WGS84, with the provenance of the file in ``predmapnet``."""
+"""GeoJSON files (RFC 7946): one feature per element, WGS84, with the provenance in the member ``predmapnet``."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class GeoJsonWriter:
 
 
 def origin_of(provenance: Mapping[str, Any], georeference: Georeference) -> dict[str, Any]:
-    """Return what a file says of itself in every format: the provenance, where its coordinates come from, and when."""
+    """Return the provenance that every format writes, completed by georeference and time."""
     created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     return {**provenance, "georeference": georeference.name, "created": created}
 
@@ -175,7 +175,7 @@ def parse_timestamp(text: str) -> int:
 
 
 def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any]:
-    """Return an element as a GeoJSON feature: what every format writes. Raises ValueError off the globe."""
+    """Return an element as a GeoJSON feature, which every format writes; raises ValueError off the globe."""
     degrees = np.round(georeference.to_wgs84(element.points), DECIMALS)
     if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
         raise ValueError(f"a {element.kind.label} lies outside the globe: the georeference does not fit the map")

@@ -1,4 +1,4 @@
-"""OSM XML with the tags of Lanelet2: the physical layer only, as a map of lines is no map of lanes.
+"""Lanelet2 files (OSM XML): the physical layer only, as a map of lines is no map of lanes.
 
 Dividers become ways of type ``line_thin``, boundaries ``road_border`` and crossings closed ways
 ``pedestrian_marking`` (Lanelet2's documentation, LinestringTagging). Whether a divider is solid or dashed is not known,

@@ -1,4 +1,4 @@
-"""A metric plane of our own, for maps that come without the frame they were made in."""
+"""Local metric plane, for maps that come without the frame they were made in."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ WGS84_SEMI_MAJOR_AXIS = 6_378_137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
 
 ORIGIN_GRID = 0.02
-"""Origins of common planes lie on a grid of this many degrees, so that later merges cut the same tiles."""
+"""Spacing of the grid on which origins of common planes lie, degrees, so that later merges cut the same tiles."""
 
 WIDEST = 1.0
-"""Maps farther apart than this are not of one city, degrees."""
+"""Largest extent of the maps of one city, degrees."""
 
 
 @dataclass(frozen=True)
 class LocalPlane:
-    """Metres east and north of a point, by the ellipsoid's radii of curvature there.
+    """Plane of metres east and north of a point, by the ellipsoid's radii of curvature there.
 
-    Leads there and back exactly. Distances are true at the latitude of the origin; 5 km north of it, at 45 degrees,
+    The way there and back is exact. Distances are true at the latitude of the origin; 5 km north of it, at 45 degrees,
     those from west to east are off by 0.08 %.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Styles for QGIS (.qml): the colours of the viewer, one file for lines and one for crossings."""
+"""QGIS styles (.qml) with the colours of the viewer, one file for lines and one for crossings."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Tracked polylines of single frames into one global map."""
+"""Integration of the maps of single frames into one global map."""

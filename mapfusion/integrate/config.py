@@ -1,4 +1,4 @@
-"""What the integrator assumes about the detector and the road; every value has a unit and a reason."""
+"""Configuration of the integrator: assumptions about the detector and the road, each with its unit."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class IntegratorConfig:
         hit_log_odds, miss_log_odds: what one sighting adds and one missed sighting takes.
         weak_log_odds: stretches of a line with less than even odds but more than this stay in the map where they
             continue a stretch with more than even odds.
-        whole_sightings: a line that no stretch of was sighted so often lives or dies as a whole, by the median of its
+        whole_sightings: a line with no stretch sighted this often is kept or dropped as a whole, by the median of its
             stretches: a false detection is false all along, also where the car hardly looked.
         max_deviation: stretches of a line whose place is known less well are left out of the map, metres.
         min_observations: elements seen in fewer frames are left out of the map.

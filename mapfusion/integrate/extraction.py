@@ -1,4 +1,4 @@
-"""From fused curves and grids to the elements of the map: what has evidence, smoothed, simplified, without knots."""
+"""Extraction of map elements from fused lines and crossings: stretches with evidence, smoothed and simplified."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import closes, hairpins, repaired_rows
 
 LOG_ODDS_LIMIT = 6.0
-"""More evidence than this does not make a map surer."""
+"""Log-odds are clamped to plus or minus this."""
 
 
 def log_odds(seen: Float, missed: Float, config: IntegratorConfig) -> Float:
-    """Return the log-odds that something exists, from sums of sightings and of missed sightings."""
+    """Return the log-odds of existence, from sums of sightings and of missed sightings."""
     odds = config.prior_log_odds + config.hit_log_odds * seen - config.miss_log_odds * missed
     return np.clip(odds, -LOG_ODDS_LIMIT, LOG_ODDS_LIMIT)
 
@@ -35,7 +35,7 @@ def log_odds(seen: Float, missed: Float, config: IntegratorConfig) -> Float:
 def line_elements(
     line: FusedLine, views: ViewGrid, parts: Float, config: IntegratorConfig, logs: Mapping[int, str]
 ) -> list[MapElement]:
-    """Return the stretches of a line that have evidence enough, as elements.
+    """Return the stretches of a line with enough evidence, as elements.
 
     ``parts`` are those of the detector's error, ``logs`` the names of the drives by number.
     """
@@ -66,7 +66,7 @@ def line_elements(
 def ring_elements(
     ring: FusedRing, views: ViewGrid, parts: Float, config: IntegratorConfig, logs: Mapping[int, str]
 ) -> list[MapElement]:
-    """Return a crossing as an element, or nothing where the evidence is too little; as :func:`line_elements`."""
+    """Return a crossing as one element, none where the evidence is too little; arguments of :func:`line_elements`."""
     if ring.evidence.observations < config.min_observations:
         return []
     held = np.argwhere(ring.level() > 0)
@@ -112,7 +112,7 @@ def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
 
 
 def _supported(odds: Float, weak: float) -> Bool:
-    """Return where a line exists: more likely than not, or weaker but in one piece with where it does (hysteresis)."""
+    """Return which stations exist: more likely than not, or weaker but connected to such ones (hysteresis)."""
     strong, possible = odds > 0.0, odds > weak
     piece = np.cumsum(np.diff(possible, prepend=False))
     return np.asarray(possible & np.isin(piece, piece[strong]))

@@ -1,4 +1,4 @@
-"""A line of the map: a curve whose stations carry position, variance and evidence, updated one curve at a time."""
+"""Line of the map whose stations carry position, variance and evidence, updated one observed curve at a time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mapfusion.integrate.matching import Correspondence, DirectedPoints, MatchLi
 from mapfusion.integrate.station_curve import INFORMATION, SCATTER, StationCurve
 
 BLEND_LENGTH = 10.0
-"""Over this distance past the common stretch an extension forgets by how far its observation was off, metres."""
+"""Decay length, past the common stretch, of the shift that leads an extension over, metres."""
 
 END = 0.6
 """A foot may lie this far past an end of the new curve, metres."""
@@ -25,12 +25,12 @@ ONES = np.ones(2)
 
 @dataclass
 class FusedLine:
-    """A divider or boundary of the map.
+    """Divider or boundary of the map.
 
     Attributes:
-        kind: what it is.
+        kind: divider or boundary.
         curve: its stations.
-        evidence: what is known of it as a whole.
+        evidence: for it as a whole.
         first: number of the first station; numbers stay with the stations when the line grows at its start.
     """
 
@@ -52,7 +52,7 @@ def fuse(line: FusedLine, new: StationCurve, match: Correspondence) -> list[Stat
         match: stations of the line (at least one) beside vertices of ``new``.
 
     Returns:
-        The parts of ``new`` that leave the line sideways and must be something else.
+        The parts of ``new`` that leave the line sideways and belong to another line.
     """
     base, last = line.curve, len(new) - 1
     station, vertex, offset = match.station, match.vertex, match.offset
@@ -102,11 +102,11 @@ def _average(base: StationCurve, new: StationCurve, match: Correspondence, verte
     return np.asarray(gain)
 
 
-def _extension(piece: StationCurve, foot: Float, shift: Float, base: Float) -> StationCurve:
-    """Lead a piece over from the base's end and stop where it comes back to the base (a closed loop).
+def _extension(part: StationCurve, foot: Float, shift: Float, base: Float) -> StationCurve:
+    """Return a part led over from the base's end, up to where it comes back to the base (a closed loop).
 
     Args:
-        piece: vertices past the end, nearest first.
+        part: vertices past the end, nearest first.
         foot: ``(2,)``, where the base's end falls on the unshifted curve.
         shift: ``(2,)``, from there to the fused end.
         base: ``(n, 2)`` stations of the base.
@@ -116,22 +116,22 @@ def _extension(piece: StationCurve, foot: Float, shift: Float, base: Float) -> S
     inner = base[min(2, len(base) - 1)] if at_start else base[max(len(base) - 3, 0)]
     outward = (end - inner) / max(math.sqrt(squared(end - inner)), 1e-9)
     # vertices beside the base's end rather than past it would fold the line back
-    ahead = (piece.points[:3] + (shift - end)) @ outward >= 0.3
+    ahead = (part.points[:3] + (shift - end)) @ outward >= 0.3
     start = int(ahead.argmax()) if ahead.any() else len(ahead)
-    gap = piece.points - foot
+    gap = part.points - foot
     away = np.sqrt((gap * gap) @ ONES)
-    points = piece.points + np.exp(away / -BLEND_LENGTH)[:, None] * shift
-    stop = len(piece)
+    points = part.points + np.exp(away / -BLEND_LENGTH)[:, None] * shift
+    stop = len(part)
     if len(base) > 24 and stop > start:
         other_end = base[-12:] if at_start else base[:12]
-        # a loop only if the piece comes anywhere near the other end
+        # a loop only if the part comes anywhere near the other end
         if (points.min(axis=0) < other_end.max(axis=0) + 0.6).all() and (
             points.max(axis=0) > other_end.min(axis=0) - 0.6
         ).all():
             near = (((points[:, None, :] - other_end[None, :, :]) ** 2).sum(axis=2) < 0.6**2).any(axis=1)
             if near.any():
                 stop = max(int(near.argmax()), start)
-    return StationCurve(points[start:stop], piece.sums[start:stop], piece.marks[start:stop])
+    return StationCurve(points[start:stop], part.sums[start:stop], part.marks[start:stop])
 
 
 def squared(vector: Float) -> float:

@@ -1,4 +1,4 @@
-"""A crossing of the map: a grid of averaged signed distances to its observed rings."""
+"""Crossing of the map as a grid of averaged signed distances to its observed rings."""
 
 from __future__ import annotations
 
@@ -13,27 +13,24 @@ from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose, transform_points
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.observations import Observation
-from mapfusion.level_lines import level_polygons
+from mapfusion.signed_distance import TRUNCATION, positive_areas, signed_distance
 
 Grid = NDArray[np.float32]
 Window = tuple[slice, slice]
 
-TRUNCATION = 1.5
-"""Signed distances are cut off here, so that one wrong ring moves the mean little, metres."""
-
 BESIDE = 0.5
-"""Cells this close to a crossing's outline tell how far an observed one lies from it, metres."""
+"""Half width of the band of cells about the outline in which scatter is measured, metres."""
 
 LOOSE_TOLERANCE = 1.5
-"""Where a crossing goes on unseen, its outline is straight to within so many cells."""
+"""Tolerance of the outline where a crossing goes on unseen, cells."""
 
 CUT_RIM = 0.75
-"""Edges of a ring this close to the rim of the ROI were cut by it and say nothing, metres."""
+"""Edges of a ring this close to the rim of the ROI were cut by it and do not count, metres."""
 
 
 @dataclass
 class FusedRing:
-    """A crossing of the map, as sums over the observations per cell of a lattice common to the whole map.
+    """Crossing of the map, as sums over its observations per cell of a lattice common to the whole map.
 
     Truncated signed distances are averaged cell by cell (Curless and Levoy, SIGGRAPH 1996) and the fused outline is
     where their mean is zero. The sums do not depend on the order of observations, nor on where a ring starts or
@@ -100,7 +97,7 @@ class FusedRing:
 
     def outline(self, cell: float) -> shapely.Polygon | None:
         """Return the largest fused outline in the global frame, or None; straight where it ends unseen."""
-        polygons = level_polygons(self.level().astype(np.float64), 0.0)
+        polygons = positive_areas(self.level().astype(np.float64))
         if not polygons:
             return None
         points = shapely.get_coordinates(polygons[0])
@@ -114,7 +111,7 @@ class FusedRing:
 
 
 def _straightened(ring: Float, loose: Bool) -> Float:
-    """Take the steps of the lattice out of the stretches of a closed ring ``(n + 1, 2)`` whose place means nothing."""
+    """Straighten the stretches of a closed ring ``(n + 1, 2)`` that are ``loose``: steps of the lattice, never seen."""
     if not loose.any() or loose.all():
         return ring
     first = int(np.argmin(loose))
@@ -132,7 +129,7 @@ def _straightened(ring: Float, loose: Bool) -> Float:
 
 @dataclass(frozen=True)
 class RingSighting:
-    """An observed ring on the lattice.
+    """Observed ring on the lattice.
 
     Attributes:
         observation: the ring.
@@ -199,40 +196,8 @@ def sight(
     rim = roi.size / 2 - CUT_RIM
     local = transform_points(global_to_ego, observation.points) / rim
     cut = ((local[:-1] > 1) & (local[1:] > 1)) | ((local[:-1] < -1) & (local[1:] < -1))
-    distance[a:c, b:d] = _signed_distance(x[a:c], y[b:d], observation.points, np.asarray(~cut.any(axis=1)))
+    distance[a:c, b:d] = signed_distance(x[a:c], y[b:d], observation.points, np.asarray(~cut.any(axis=1)), np.float32)
     return RingSighting(observation, low, distance, visible, clear)
-
-
-def _signed_distance(x: Float, y: Float, ring: Float, counts: Bool) -> Grid:
-    """Return the truncated signed distance from cells to a ring; edges that do not count bound, but are not near.
-
-    Args:
-        x: ``(rows,)``, metres.
-        y: ``(columns,)``, metres.
-        ring: ``(n + 1, 2)``, closed.
-        counts: ``(n,)``, which edges distances are taken to.
-    """
-    origin = np.array([x[0], y[0]])
-    start, stop = (ring[:-1] - origin).astype(np.float32), (ring[1:] - origin).astype(np.float32)
-    # edges come first, so that the innermost loops are long
-    px = (x - origin[0]).astype(np.float32)[:, None]
-    py = (y - origin[1]).astype(np.float32)
-    (x0, y0), (x1, y1) = start.T[:, :, None], stop.T[:, :, None]
-    # even-odd rule along rows; the abscissa of an edge at height y depends on y alone
-    rise = np.where(y1 == y0, np.float32(1e-6), y1 - y0)
-    crossed = (y0 > py) != (y1 > py)
-    abscissa = x0 + (py - y0) / rise * (x1 - x0)
-    inside = np.logical_xor.reduce(crossed[:, None] & (px < abscissa[:, None]))
-    if not counts.any():
-        return np.where(inside, np.float32(TRUNCATION), np.float32(-TRUNCATION))
-    first, edge = start[counts], (stop - start)[counts]
-    square = np.maximum((edge**2).sum(axis=1), np.float32(1e-9))[:, None, None]
-    ex, ey = edge.T[:, :, None, None]
-    dx, dy = px - first[:, 0, None, None], py - first[:, 1, None, None]
-    along = ((dx * ex + dy * ey) / square).clip(0, 1)
-    nearest = np.sqrt(((dx - along * ex) ** 2 + (dy - along * ey) ** 2).min(axis=0))
-    nearest = np.minimum(nearest, np.float32(TRUNCATION))
-    return np.asarray(np.where(inside, nearest, -nearest), dtype=np.float32)
 
 
 def new_ring(sighting: RingSighting, timestamp: int) -> FusedRing:

@@ -15,6 +15,7 @@ from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
 from mapfusion.geometry import rigid_pose_problem
 from mapfusion.ground import ground_problem
 from mapfusion.integrate.association import (
+    MATCH_REACH,
     LineCandidate,
     LineMatching,
     RingCandidates,
@@ -45,9 +46,6 @@ SHORTEST_LINE = 3
 
 SIDE_BY_SIDE = 0.25
 """Two lines that single frames showed side by side in more than this share of their frames are not one."""
-
-MATCH_REACH = 1.5
-"""Single stations are compared up to this multiple of the match distance, which bounds their mean."""
 
 
 @dataclass(frozen=True)

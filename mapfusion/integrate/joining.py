@@ -1,4 +1,4 @@
-"""Pieces of one line put together: ends that run into each other, unless what lies between was looked at and bare.
+"""Joining of elements that are one line: their ends run into each other, and no bare ground was seen between.
 
 A detector that always ends a line at the same place, or two tracks of one line that never were one, leave two lines in
 the map where the road has one. They are joined here, when the map is made, so that the evidence stays as it was seen
@@ -15,26 +15,26 @@ from scipy.spatial import cKDTree
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.chains import LineEnd, chain_lines
-from mapfusion.elements import MapElement, united
+from mapfusion.elements import MapElement, united_origins
 from mapfusion.geometry import arc_length
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import repaired_rows
 
 DIRECTION_LENGTH = 4.0
-"""The direction of an end is that of the last so many metres."""
+"""Length over which the direction of an end is taken, metres."""
 
-SHORTEST_LOOP = 8.0
-"""A shorter line is not led back to its own start, metres."""
+SHORTEST_CLOSED = 8.0
+"""Shorter lines are not closed, metres."""
 
 
-SAME_PLACE = 0.3
-"""Ends this close are one vertex of the joined line, metres."""
+ONE_VERTEX = 0.3
+"""Distance up to which two ends become one vertex of the joined line, metres."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """Two ends that may be one line.
+    """Link of two ends that may be one line.
 
     Attributes:
         cost: metres apart, and more where they do not point at each other; the least comes first.
@@ -49,7 +49,7 @@ class Link:
 
 @dataclass(frozen=True)
 class Ends:
-    """The ends of elements, as arrays of equal length; crossings and closed lines have none.
+    """Ends of elements, as arrays of equal length; crossings and closed lines have none.
 
     Attributes:
         element: ``(n,) int64``, which element.
@@ -84,10 +84,10 @@ def ends_of(elements: Sequence[MapElement]) -> Ends:
     )
 
 
-def all_ends(pieces: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
+def all_ends(several: Sequence[tuple[Sequence[MapElement], Ends]]) -> Ends:
     """Put the ends of several lists of elements together, numbered as if the lists were one."""
-    known = [ends for _, ends in pieces]
-    before = np.cumsum([0, *(len(elements) for elements, _ in pieces)])
+    known = [ends for _, ends in several]
+    before = np.cumsum([0, *(len(elements) for elements, _ in several)])
     counts = [len(ends.element) for ends in known]
     nothing = ends_of([])
     columns = (
@@ -127,7 +127,7 @@ def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, c
     for row in np.flatnonzero(keep).tolist():
         one, two = ((int(ends.element[k]), int(ends.end[k])) for k in (first[row], second[row]))
         ahead = float(along[row])
-        if one[0] == two[0] and (ahead < 0.0 or elements[one[0]].length < SHORTEST_LOOP):
+        if one[0] == two[0] and (ahead < 0.0 or elements[one[0]].length < SHORTEST_CLOSED):
             continue
         if ahead > config.max_gap:
             share = np.linspace(0.0, 1.0, int(ahead) + 2)[1:-1, None]
@@ -137,11 +137,11 @@ def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, c
     return sorted(links, key=lambda link: (link.cost, link.ends))
 
 
-def chained(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
+def joined_along(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
     """Join along links, each end once, in their order.
 
     Returns:
-        The least number among the pieces of each element, ascending, and the element.
+        The least number in each joined element, ascending, and the element.
     """
 
     def join(before: MapElement, after: MapElement, number: int) -> MapElement:
@@ -170,7 +170,7 @@ def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement
     one, one_deviation = _cut_back(_reversed(before), overlap / 2)
     two, two_deviation = _cut_back(after, overlap / 2)
     share = before.length / max(before.length + after.length, 1e-9)
-    skip = int(len(two) > 1 and np.linalg.norm(two[0] - one[0]) < SAME_PLACE)
+    skip = int(len(two) > 1 and np.linalg.norm(two[0] - one[0]) < ONE_VERTEX)
     points = np.concatenate([one[::-1], two[skip:]])
     rows = repaired_rows(points)
     deviation: Float | None = None
@@ -185,7 +185,7 @@ def _joined(before: MapElement, after: MapElement, overlap: float) -> MapElement
         observations=max(before.observations, after.observations),
         first_seen=min(before.first_seen, after.first_seen),
         last_seen=max(before.last_seen, after.last_seen),
-    ).with_origins(united([before.origins, after.origins]))
+    ).with_origins(united_origins([before.origins, after.origins]))
 
 
 def _cut_back(element: MapElement, length: float) -> tuple[Float, Float | None]:

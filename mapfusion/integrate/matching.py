@@ -43,7 +43,7 @@ class MatchLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Stations of a map beside a curve.
+    """Correspondence of stations of the map with a curve beside them.
 
     Attributes:
         station: ``(n,) int64``, rows of the stations that were compared.

@@ -1,4 +1,4 @@
-"""From the polylines of one frame to observations in the global frame; what is broken is named and left out."""
+"""Observations in the global frame from the polylines of one frame; broken ones are counted and left out."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES,
 from mapfusion.integrate.views import view_weight
 
 SURE_SCORE = 0.5
-"""A detection with this score is a whole sighting."""
+"""Score from which on a detection is a whole sighting."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """One detected line or ring, in the global frame.
+    """Detected line or ring, in the global frame.
 
     Attributes:
-        kind: what it is.
+        kind: of the element.
         track: its log and its id there.
         curve: its vertices in the global frame, of a line one station apart, with what the sighting says there. How
             much of a look at each vertex it answers is the view weight, less below :data:`SURE_SCORE`, where the
@@ -47,7 +47,7 @@ class Observation:
 
     @property
     def sighting(self) -> float:
-        """What the sighting counts for: 1 at :data:`SURE_SCORE`, in proportion to the score, at most 1.5."""
+        """Weight of the sighting: 1 at :data:`SURE_SCORE`, in proportion to the score, at most 1.5."""
         return float(self.curve.seen[0])
 
 
@@ -87,11 +87,11 @@ def observe(
         ring = int(frame_map.kinds[row]) == ElementKind.PED_CROSSING
         (left, rear), (right, front) = extent
         within = max(-left, right) <= half[0] and max(-rear, front) <= half[1]
-        pieces = _ring_pieces(points, box, within) if ring else [points] if within else clip_line(points, frame_map.roi)
-        if not pieces:
+        parts = _ring_parts(points, box, within) if ring else [points] if within else clip_line(points, frame_map.roi)
+        if not parts:
             rejections["ring without area" if ring else "outside the region of interest"] += 1
-        (rings if ring else lines).extend(pieces)
-        (ring_rows if ring else line_rows).extend([row] * len(pieces))
+        (rings if ring else lines).extend(parts)
+        (ring_rows if ring else line_rows).extend([row] * len(parts))
     curves = _stations(lines, config.station_spacing)
     rejections.update({"line without length": len(lines) - len(curves)} if len(curves) < len(lines) else {})
     used = [line_rows[number] for number in curves] + ring_rows
@@ -107,7 +107,7 @@ def _observations(
     log: int,
     visible: shapely.Geometry | None,
 ) -> list[Observation]:
-    """Say where the points of curves of the ego frame lie and what they are worth, all at once."""
+    """Return curves of the ego frame as observations, all at once."""
     if not rows:
         return []
     local = np.concatenate(curves)
@@ -193,8 +193,8 @@ def _element_problem(
     return None
 
 
-def _ring_pieces(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:
-    """Clip a ring; one that crosses itself is repaired and its largest part kept."""
+def _ring_parts(points: Float, box: shapely.Polygon, within: bool) -> list[Float]:
+    """Clip a ring and keep its largest part; one that crosses itself is repaired."""
     if len(points) < 3:
         return []
     polygon = shapely.Polygon(points)

@@ -27,23 +27,23 @@ from mapfusion.integrate.views import ViewGrid
 STATE_VERSION = 3
 """Version of the file's layout; files of another version are refused."""
 
-Item = TypeVar("Item")
+Holder = TypeVar("Holder")
 
 
 @dataclass
 class IntegratorState:
-    """All that a map integrator knows; everything else that it holds follows from this.
+    """State of a map integrator; all else that it holds follows from this.
 
     Attributes:
         config: assumptions about the detector and the road.
-        rejections: what was left out, counted by reason.
+        rejections: number of frames and elements left out, by reason.
         frames: number of frames that were fused.
         next_id: id of the next new element.
         frame_log: which frames of which drives were taken in.
-        errors: what was learnt of the detector's errors.
+        errors: model of the detector's errors, learnt so far.
         lines: dividers and boundaries by id.
         rings: crossings by id.
-        views: where the car has looked.
+        views: how often the car has looked where.
     """
 
     config: IntegratorConfig = field(default_factory=IntegratorConfig)
@@ -171,7 +171,7 @@ def _restored(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Integr
     return state
 
 
-def _flat(items: Iterable[Item], part: Callable[[Item], NDArray[Any]], dtype: type) -> NDArray[Any]:
+def _flat(items: Iterable[Holder], part: Callable[[Holder], NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate([np.zeros(0, dtype), *(part(item) for item in items)])
 
 

@@ -1,4 +1,4 @@
-"""Stations along a line and what is known at each of them."""
+"""Curve of stations along a line, with the sums of the observations at each of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLACES, TRACKS = range(2)
 
 @dataclass
 class StationCurve:
-    """Stations along a line, about one spacing apart; arrays of equal length.
+    """Curve of stations along a line, about one spacing apart; arrays of equal length.
 
     Attributes:
         points: ``(n, 2) float64``, metres, global frame.

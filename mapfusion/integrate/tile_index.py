@@ -1,4 +1,4 @@
-"""Which elements are near: a hash of square tiles, so that a frame touches only its surroundings."""
+"""Index of elements by square tiles, so that a frame touches only its surroundings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def _key(cells: Integer) -> Integer:
 
 
 class TileIndex:
-    """From tiles to the ids of the elements that have a point in them."""
+    """Ids of elements by the tiles that they have a point in."""
 
     def __init__(self) -> None:
         self._elements: dict[int, set[int]] = {}

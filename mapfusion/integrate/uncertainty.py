@@ -1,4 +1,4 @@
-"""How far a fused element may be from the truth: what of the detector's errors averages out, and what does not.
+"""Uncertainty of fused elements: which part of the detector's errors averages out, and which does not.
 
 The error of a detection across the line is the sum of parts that differ in how long they last: one that is new in
 every frame, some that stay while the car moves on by a certain distance, one that stays as long as the track does, and
@@ -26,50 +26,50 @@ from mapfusion.integrate.marks import PLACE, distinct
 from mapfusion.integrate.station_curve import INFORMATION, OBSERVATIONS, PLACES, SCATTER, TRACKS, StationCurve
 
 LASTING = np.array([10.0, 30.0])
-"""Distances that the car goes until an error has changed: metres, for each of the parts between frame and track."""
+"""Correlation lengths of the parts between frame and track: how far the car goes until they change, metres."""
 
 PRIOR_SHARES = np.array([0.5, 0.15, 0.2, 0.15])
-"""Share in the variance of a detection before anything was learnt: new in every frame, :data:`LASTING`, track."""
+"""Prior shares in the variance of a detection: new in every frame, :data:`LASTING`, track."""
 
 PRIOR_SPREAD = 0.6
 """Standard deviation of the prior of each share."""
 
 NOTHING_LASTS = 0.1
-"""Probability, before anything was learnt, that all of the error is new in every frame."""
+"""Prior probability that all of the error is new in every frame."""
 
 PRIOR_OBSERVATIONS = 6.0
-"""Observations that the prior of the noise of one element stands for."""
+"""Number of observations that the prior of an element's noise stands for."""
 
 WINDOW = 20
-"""Stations over which the scatter of an element is averaged; as far as the errors of one detection hang together."""
+"""Number of stations over which the scatter of an element is averaged: as far as errors of one detection correlate."""
 
 RING_ROUNDING = 0.095
-"""Corners of crossings are rounded by the cells and the cut-off of their signed distances, metres."""
+"""Deviation by which cells and cut-off of the signed distances round the corners of crossings, metres."""
 
 PROBE_SPACING = 8
-"""Every so many stations differences are taken."""
+"""Spacing of the stations at which differences are taken, stations."""
 
 CAPACITY = 4096
-"""Records are compared and forgotten when there are so many."""
+"""Number of kept passages at which they are compared and forgotten."""
 
 COMPANIONS = (1, 2, 3, 5, 8, 13)
-"""Each record is compared with those of its station that came so many records later."""
+"""Each passage is compared with those of its station that come so many places later."""
 
-OUTLIER = 9.0 / 0.455
-"""Squared differences count as at most so many medians: three deviations of a normal distribution."""
+LARGEST_SQUARE = 9.0 / 0.455
+"""Largest squared difference in medians: three deviations of a normal distribution."""
 
 HASH = np.array([1.0, 1e5 + 0.7])
 """Weights that make one number of two."""
 
 LEAST_VARIANCE = 1e-3
-"""No detector is better than this, as a multiple of the variance that it is assumed to have."""
+"""Smallest variance of a detector, as a multiple of the assumed one."""
 
 LAGS = np.array([0.0, 2.5, 7.5, 15.0, 30.0, 60.0, np.inf])
 """Classes of the distance that the car went between two observations, metres."""
 
 
 class Probe(NamedTuple):
-    """Where one detection passed some stations of an element.
+    """Passage of one detection at some stations of an element.
 
     Attributes:
         element: id of the element.
@@ -157,7 +157,7 @@ def _first_of_equal(group: Integer, contrast: Float) -> Rows:
 
 @dataclass
 class ErrorModel:
-    """Variance of the parts of a detection's error, as multiples of the variance that the detector is assumed to have.
+    """Model of a detection's error: the variances of its parts, as multiples of the assumed variance.
 
     Attributes:
         squares: ``(2, classes) float64``, sum of the squared differences by same or other track and by lag.
@@ -199,7 +199,7 @@ class ErrorModel:
     def _count_in(self, differences: _Differences) -> None:
         other_track, lag, square, contrast = differences
         # two lines taken for one, or a ghost beside a line, say nothing of the detector's error
-        square = np.minimum(square, OUTLIER * np.median(square))
+        square = np.minimum(square, LARGEST_SQUARE * np.median(square))
         group = other_track * (len(LAGS) - 1) + np.searchsorted(LAGS, lag, side="right") - 1
         shape = self.pairs.shape
         for total, values in ((self.squares, square), (self.lags, lag), (self.pairs, np.ones_like(lag))):
@@ -306,7 +306,7 @@ def _mean_variance(parts: Float, observations: Float, places: Marks, tracks: Mar
 
 
 def _noise(found: Float | float, expected: Float | float) -> Float | float:
-    """Return by how much an element's observations scatter more than the map's do, as a ratio of variances."""
+    """Return the ratio of an element's scatter to that expected for the whole map, drawn to 1 by the prior."""
     return (PRIOR_OBSERVATIONS + found) / (PRIOR_OBSERVATIONS + expected)
 
 

@@ -1,4 +1,4 @@
-"""Where the car has looked: the evidence against what was not seen, independent of the order of frames."""
+"""Views: how often the car has looked where, the evidence against elements that it did not see there."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TILE_CELLS = 64
 
 
 SHADOW_RIM = 0.5
-"""This close to ground that nobody could see, nothing found means nothing, metres."""
+"""Width of the rim of visible ground in which a missing detection means nothing, metres."""
 
 
 def clearly_visible(frame_map: FrameMap) -> shapely.Geometry | None:
@@ -35,7 +35,7 @@ def clearly_visible(frame_map: FrameMap) -> shapely.Geometry | None:
 def view_weight(
     points_ego: Float, roi: RegionOfInterest, config: IntegratorConfig, visible: shapely.Geometry | None = None
 ) -> Float:
-    """How much a missing detection at each point says.
+    """Return the weight of a missing detection at each point.
 
     Args:
         points_ego: ``(..., 2)``, metres, ego frame.

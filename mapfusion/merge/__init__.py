@@ -1,1 +1,1 @@
-"""Maps of many drives into one map."""
+"""Merging of the maps of many drives into one map."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class MergeConfig:
-    """What is assumed when maps are merged.
+    """Assumptions of a merge.
 
     Attributes:
         match_distance: stretches of different maps are one line if they lie this close, metres.

@@ -16,14 +16,14 @@ from mapfusion.ground import inside
 from mapfusion.merge.config import MergeConfig
 
 VIEW_LENGTH = 60.0
-"""A car sees about this much of a road at a time, metres."""
+"""Length of road that a car sees at a time, about, metres."""
 
 LOOK_REACH = 8.0
-"""What lies within twice this of an element was looked at as often as it, metres."""
+"""Ground within twice this distance of an element was looked at as often as the element, metres."""
 
 
 class Looks:
-    """In how many frames a drive has looked at a place, as far as its map tells: as often as it saw what is near.
+    """Number of frames in which a drive looked at each place, taken from the elements near it.
 
     Args:
         elements: all that the map has around.
@@ -49,20 +49,20 @@ class Looks:
 
 
 def frames_per_place(element: MapElement) -> float:
-    """Return in about how many frames each place of an element was seen: a long one is never seen as a whole."""
+    """Return the number of frames that saw each place of an element, about: a long one is never seen as a whole."""
     size = float(np.linalg.norm(np.ptp(element.points, axis=0)))
     return element.observations * VIEW_LENGTH / (VIEW_LENGTH + size)
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """What one map has in a tile.
+    """Contribution of one map to a tile.
 
     Attributes:
         source: number of the map.
         elements: of one kind, metres, corrected.
-        ground: what the map speaks of.
-        looks: in how many frames the drive looked where.
+        ground: that the map speaks of.
+        looks: number of frames that looked at each place.
     """
 
     source: int
@@ -72,7 +72,7 @@ class Contribution:
 
 
 def information(element: MapElement, config: MergeConfig) -> Float:
-    """Inverse variance of a line at its vertices, ``(n,)``, 1 / m²: from the file, or from the number of frames."""
+    """Return the inverse variance of a line at its vertices, ``(n,)``, 1 / m²: stated, or by its number of frames."""
     deviation = element.deviation
     if deviation is None:
         alike = config.default_alike + (1.0 - config.default_alike) / max(element.observations, 1)
@@ -81,12 +81,12 @@ def information(element: MapElement, config: MergeConfig) -> Float:
 
 
 def certainty(element: MapElement, config: MergeConfig) -> float:
-    """Log-odds that one map gives an element: by its confidence, no more than its frames can bear out."""
+    """Return the log-odds that one map gives an element: by its confidence, limited by its number of frames."""
     most = min(config.log_odds_limit, config.hit_log_odds * max(element.observations, 1))
     return float(np.clip(logit(np.clip(element.confidence, 1e-3, 1 - 1e-3)), 0.2, most))
 
 
 def doubt(contribution: Contribution, points: Float, config: MergeConfig) -> Float:
-    """Log-odds that a map takes from what it lacks at ``(n, 2)`` points; more, the oftener its drive looked there."""
+    """Return the log-odds that a map takes at ``(n, 2)`` points from what it lacks: more where it looked oftener."""
     taken = np.minimum(config.miss_log_odds * contribution.looks.at(points), config.miss_limit)
     return np.asarray(taken * inside(contribution.ground, points))

@@ -1,4 +1,4 @@
-"""How each of many maps must move, from alignments of pairs: linear least squares, wrong pairs weighted down."""
+"""Corrections of the poses of many maps from alignments of pairs: robust linear least squares."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ from mapfusion.alignment import Alignment, move
 from mapfusion.arrays import Float
 
 PRIOR = np.array([1.0, 1.0, np.radians(0.5)])
-"""Standard deviation of a drive's own pose: metres, metres, radians. It holds each group of maps at its mean."""
+"""Standard deviation of a drive's own pose: metres, metres, radians; holds each group of maps at its mean."""
 
-OUTLIER = 0.5
-"""A pair that the others contradict by this much loses half its weight, metres."""
+HALF_WEIGHT = 0.5
+"""Residual at which a pair of maps loses half its weight, metres."""
 
 ROUNDS = 8
+"""Number of rounds of reweighting."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Where a map must move: turned about its centre, then shifted.
+    """Correction of one map: turned about its centre, then shifted.
 
     Attributes:
         centre: ``(2,)``, metres.
@@ -76,7 +77,7 @@ def solve_corrections(centres: Float, pairs: Mapping[tuple[int, int], Alignment]
         for place, ((first, second), (design, wanted, _)) in enumerate(zip(keys, blocks, strict=True)):
             index = np.concatenate([3 * first + np.arange(3), 3 * second + np.arange(3)])
             left = float(np.linalg.norm((design @ solution[index] - wanted)[:2]))
-            trust[place] = 1.0 / (1.0 + (left / OUTLIER) ** 2)
+            trust[place] = 1.0 / (1.0 + (left / HALF_WEIGHT) ** 2)
     values_of = solution.reshape(count, 3)
     return [Correction(centre, row[:2], float(row[2])) for centre, row in zip(centres, values_of, strict=True)]
 

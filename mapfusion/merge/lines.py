@@ -1,4 +1,4 @@
-"""Lines of several maps made into one set: each stretch is the mean of all maps that have it, by their evidence.
+"""Fusion of the lines of several maps: each stretch is the mean of all maps that have it, by their evidence.
 
 The maps come in a fixed order. The first one's lines are the references. Those of the next are paired with them
 stretch by stretch (:mod:`mapfusion.stretches`); what has no partner becomes a reference itself, linked to the line it
@@ -16,29 +16,29 @@ import numpy as np
 
 from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.chains import LineEnd, chain_lines
-from mapfusion.elements import ElementKind, MapElement, united
+from mapfusion.elements import ElementKind, MapElement, united_origins
 from mapfusion.geometry import arc_length, tangents
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
 from mapfusion.merge.tiles import MergedLine
-from mapfusion.stretches import Pairing, Samples, pair, runs, sample_lines, settle
+from mapfusion.stretches import Pairing, Samples, equal_runs, pair, sample_lines, settle
 
 SPACING = 1.0
 """Distance between the stations of a reference, metres; other maps are sampled twice as densely."""
 
-BLEND_LENGTH = 10.0
-"""A step between two stretches that are linked is spread over this distance, metres."""
+STEP_LENGTH = 10.0
+"""Length over which the step between two linked stretches is spread, metres."""
 
 SHORTEST_LOOP = 20
-"""A line of fewer stations is not closed when its ends meet."""
+"""Lines of fewer stations are not closed where their ends meet."""
 
 LINK_REACH = 2.5
-"""A line goes on from a reference if it leaves it this close to the reference's end, metres."""
+"""Largest distance between a reference's end and the place where a line leaves it to go on, metres."""
 
 
 @dataclass
 class _References:
-    """Stations of all references, one array entry each, and what was found beside them."""
+    """Stations of all references, one array entry each, and the sums of the samples beside them."""
 
     points: Float = field(default_factory=lambda: np.empty((0, 2)))
     line: Integer = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -130,7 +130,7 @@ def _contribute(references: _References, kind: ElementKind, contribution: Contri
         first, stop = samples.bounds(number)
         nodes: list[tuple[int, int, int, int]] = []  # line, row it is entered at and left at, last sample
         states = settle(pairing.found[first:stop].astype(np.int64), round(config.min_new / SPACING * 2))
-        for start, end, found in runs(states):
+        for start, end, found in equal_runs(states):
             rows = slice(first + start, first + end)
             if found:
                 nodes.extend(_visited(references, pairing, rows, element, contribution.source))
@@ -183,13 +183,13 @@ def _visited(
     partner = pairing.partner[rows]
     partner = partner[partner >= 0]
     nodes = []
-    for start, stop, line in runs(references.line[partner]):
+    for start, stop, line in equal_runs(references.line[partner]):
         nodes.append((line, int(partner[start]), int(partner[stop - 1]), stop - start))
         known = references.evidence[line]
         known.observations[source] = max(known.observations.get(source, 0), element.observations)
         known.first_seen = min(known.first_seen, element.first_seen)
         known.last_seen = max(known.last_seen, element.last_seen)
-        known.origins = united([known.origins, element.origins])
+        known.origins = united_origins([known.origins, element.origins])
     return nodes
 
 
@@ -242,8 +242,8 @@ def _blended(before: MergedLine, after: MergedLine, _link: int) -> MergedLine:
     gap = points[0] - before.points[-1]
     step = gap - (gap @ tangent) * tangent
     share = before.values[-1, 0] / (before.values[-1, 0] + values[0, 0])
-    decay_before = np.exp(-np.linalg.norm(before.points - before.points[-1], axis=1) / BLEND_LENGTH)
-    decay_after = np.exp(-np.linalg.norm(points - points[0], axis=1) / BLEND_LENGTH)
+    decay_before = np.exp(-np.linalg.norm(before.points - before.points[-1], axis=1) / STEP_LENGTH)
+    decay_after = np.exp(-np.linalg.norm(points - points[0], axis=1) / STEP_LENGTH)
     return before.with_evidence_of(
         after,
         np.concatenate(
@@ -258,6 +258,6 @@ def _alive(line: MergedLine, config: MergeConfig) -> list[MergedLine]:
     states = settle((line.values[:, 1] > 0.0).astype(np.int64), round(config.max_gap / SPACING))
     return [
         replace(line, points=line.points[a:b], values=line.values[a:b])
-        for a, b, alive in runs(states)
+        for a, b, alive in equal_runs(states)
         if alive and b - a >= 2
     ]

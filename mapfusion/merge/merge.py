@@ -1,4 +1,4 @@
-"""Maps of many drives made into one: poses corrected between drives, evidence added up, tile by tile."""
+"""Merge of the maps of many drives: poses corrected between drives, evidence added up, tile by tile."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ Progress = Callable[[int, int, str], None]
 """Called as ``progress(done, in all, what)``."""
 
 CACHED_MAPS = 48
-"""Maps that are held in memory at a time; neighbouring tiles need the same ones."""
+"""Number of maps held in memory at a time; neighbouring tiles need the same ones."""
 
 
 @dataclass(frozen=True)
-class _Entry:
-    """What is remembered of a map while it is not in memory."""
+class _MapSummary:
+    """Summary of a map while it is not in memory."""
 
     name: str
     place: int
@@ -55,8 +55,8 @@ class _Entry:
         return (self.low + self.high) / 2
 
 
-class _Shelf:
-    """Maps that are read when they are needed; a few are kept."""
+class _MapCache:
+    """Cache of maps that are read when they are needed."""
 
     def __init__(self, maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None) -> None:
         self.maps = maps
@@ -74,7 +74,7 @@ class _Shelf:
         return landmarks(self._raw(place))
 
     def _corrected(self, place: int) -> tuple[GlobalMap, shapely.Geometry]:
-        """A map and its ground where they belong."""
+        """Return a map and its ground, both corrected."""
         raw = self._raw(place)
         ground = coverage(raw, self.plane)
         correction = self.corrections.get(place)
@@ -84,26 +84,26 @@ class _Shelf:
         return GlobalMap(moved, raw.provenance), shapely.transform(ground, correction.apply)
 
 
-_shelf: _Shelf
-"""Of a worker process."""
+_cache: _MapCache
+"""Cache of a worker process."""
 
 
 def _start_worker(
     maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None, corrections: dict[int, Correction]
 ) -> None:
-    global _shelf
-    _shelf = _Shelf(maps, plane)
-    _shelf.corrections = corrections
+    global _cache
+    _cache = _MapCache(maps, plane)
+    _cache.corrections = corrections
 
 
 def _align_in_worker(task: tuple[int, list[int]]) -> list[tuple[int, int, Alignment]]:
-    return _align_with(_shelf, *task)
+    return _align_with(_cache, *task)
 
 
 def _fuse_in_worker(
     task: tuple[Tile, list[int], Sequence[str], MergeConfig],
 ) -> tuple[list[MergedLine], list[MapElement]]:
-    return _fuse_tile(_shelf, *task)
+    return _fuse_tile(_cache, *task)
 
 
 def merge_maps(
@@ -124,10 +124,10 @@ def merge_maps(
 
     Returns:
         The merged map; each element's ``sources`` name the drives it comes from, or the maps if those do not name any.
-        And what became of the maps.
+        And the report on the maps.
     """
     names = list(names) if names is not None else [f"map {i}" for i in range(len(maps))]
-    merge = _Merge(_Shelf(maps, plane), names, config or MergeConfig())
+    merge = _Merge(_MapCache(maps, plane), names, config or MergeConfig())
     elements = tuple(merge.elements(1, None))
     return GlobalMap(elements, {"sources": sorted(names)}), merge.report()
 
@@ -157,7 +157,7 @@ def merge_files(
     boxes = [box for box in (read_box(path) for path in paths) if box is not None]
     plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
     names = short_names(paths)
-    merge = _Merge(_Shelf(list(paths), plane), names, config or MergeConfig())
+    merge = _Merge(_MapCache(list(paths), plane), names, config or MergeConfig())
     told = {"generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
     observed = merge.observed()
     if observed is not None:
@@ -171,12 +171,12 @@ def merge_files(
 class _Merge:
     """One merge, from the maps to the elements of the result."""
 
-    def __init__(self, shelf: _Shelf, names: Sequence[str], config: MergeConfig) -> None:
-        self.shelf = shelf
+    def __init__(self, cache: _MapCache, names: Sequence[str], config: MergeConfig) -> None:
+        self.cache = cache
         self.config = config
-        entries = [entry for entry in (_entry(shelf, i, name) for i, name in enumerate(names)) if entry is not None]
+        entries = [entry for entry in (_summary(cache, i, name) for i, name in enumerate(names)) if entry is not None]
         entries.sort(key=lambda entry: (-entry.evidence, entry.digest, entry.name))
-        first: dict[str, _Entry] = {}
+        first: dict[str, _MapSummary] = {}
         for entry in entries:
             first.setdefault(entry.digest, entry)
         self.entries = list(first.values())
@@ -204,11 +204,11 @@ class _Merge:
             yield self._counted(element)
         for entry in self.entries:
             if entry.place in apart:
-                for element in self.shelf.raw(entry.place):
+                for element in self.cache.raw(entry.place):
                     yield self._counted(_named(element, entry.name))
 
     def report(self) -> MergeReport:
-        """What came of it, once all elements were taken."""
+        """Return the report, once all elements were taken."""
         statuses = tuple(sorted(self.statuses, key=lambda status: status.name))
         return MergeReport(statuses, self.duplicates, self.counts, self.metres, self.tile_count)
 
@@ -241,12 +241,12 @@ class _Merge:
             if contradicts:
                 apart.add(entry.place)
             if partners:
-                self.shelf.corrections[entry.place] = correction
+                self.cache.corrections[entry.place] = correction
             shift, turn = float(np.linalg.norm(correction.shift)), float(np.degrees(correction.turn))
             self.statuses.append(MapStatus(entry.name, shift, turn, partners, note, contradicts))
         return apart
 
-    def _fused(self, entries: list[_Entry], jobs: int, say: Progress) -> Iterator[MapElement]:
+    def _fused(self, entries: list[_MapSummary], jobs: int, say: Progress) -> Iterator[MapElement]:
         reach = self.config.margin + 6.0
         members: dict[Tile, list[int]] = {}
         for entry in entries:
@@ -288,16 +288,16 @@ class _Merge:
     def _each(self, direct: Any, in_worker: Any, tasks: Sequence[Any], jobs: int) -> Iterator[Any]:
         """Do the tasks here or in processes, results in order."""
         if jobs <= 1 or len(tasks) < 2:
-            yield from (direct(self.shelf, *task) for task in tasks)
+            yield from (direct(self.cache, *task) for task in tasks)
             return
-        shelf = (self.shelf.maps, self.shelf.plane, self.shelf.corrections)
-        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_start_worker, initargs=shelf) as pool:
+        cache = (self.cache.maps, self.cache.plane, self.cache.corrections)
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_start_worker, initargs=cache) as pool:
             yield from pool.map(in_worker, tasks, chunksize=4)
 
 
-def _entry(shelf: _Shelf, place: int, name: str) -> _Entry | None:
+def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
     """Look at a map once, before anything is merged; None for an empty one."""
-    raw = shelf.raw(place)
+    raw = cache.raw(place)
     if not len(raw):
         return None
     points = np.concatenate([element.points for element in raw])
@@ -309,10 +309,10 @@ def _entry(shelf: _Shelf, place: int, name: str) -> _Entry | None:
     evidence = sum(element.length * element.observations for element in raw)
     low, high = points.min(axis=0), points.max(axis=0)
     observed = raw.provenance.get("observed")
-    return _Entry(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed)
+    return _MapSummary(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed)
 
 
-def _partners(entries: Sequence[_Entry], most: int) -> list[tuple[int, list[int]]]:
+def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list[int]]]:
     """Return for each map those that it shares ground with and comes before, neighbours after neighbours."""
     boxes = [shapely.box(*(entry.low - 5.0), *(entry.high + 5.0)) for entry in entries]
     chosen: set[tuple[int, int]] = set()
@@ -330,20 +330,20 @@ def _partners(entries: Sequence[_Entry], most: int) -> list[tuple[int, list[int]
     return sorted((task for task in tasks if task[1]), key=lambda task: spot[task[0]])
 
 
-def _align_with(shelf: _Shelf, place: int, others: Sequence[int]) -> list[tuple[int, int, Alignment]]:
+def _align_with(cache: _MapCache, place: int, others: Sequence[int]) -> list[tuple[int, int, Alignment]]:
     """Align one map with each of several others."""
-    source = shelf.landmarks(place)
-    return [(place, other, align(source, shelf.landmarks(other))) for other in others]
+    source = cache.landmarks(place)
+    return [(place, other, align(source, cache.landmarks(other))) for other in others]
 
 
 def _fuse_tile(
-    shelf: _Shelf, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
+    cache: _MapCache, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
 ) -> tuple[list[MergedLine], list[MapElement]]:
     """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings."""
     low, high = tile.low - config.margin, tile.high + config.margin
     loaded = []
     for place in places:
-        global_map, ground = shelf.corrected(place)
+        global_map, ground = cache.corrected(place)
         around = Looks(part for element in global_map for part in _in_box(element, low, high))
         loaded.append((place, global_map, ground, around))
     pieces: list[MergedLine] = []

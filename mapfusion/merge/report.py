@@ -1,4 +1,4 @@
-"""What a merge has to tell: what became of each map, and how the maps are called."""
+"""Report of a merge: the treatment of each map, and short names for map files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class MapStatus:
-    """What became of one of the maps.
+    """How one input map was treated.
 
     Attributes:
         name: of the map.
@@ -30,7 +30,7 @@ class MapStatus:
 
 @dataclass(frozen=True)
 class MergeReport:
-    """What came of a merge.
+    """Report of a merge.
 
     Attributes:
         maps: one entry per map, by name.
@@ -47,7 +47,7 @@ class MergeReport:
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """Name files by their stems, with as many folders before as it takes to tell them apart.
+    """Return names of files: their stems, with as many folders before as it takes to tell them apart.
 
     Raises:
         ValueError: the same file is given twice.

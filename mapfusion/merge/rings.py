@@ -1,4 +1,4 @@
-"""Crossings of several maps made into one set: signed distances averaged on a grid (Curless and Levoy, 1996)."""
+"""Fusion of the crossings of several maps: signed distances averaged on a grid (Curless and Levoy, 1996)."""
 
 from __future__ import annotations
 
@@ -10,21 +10,18 @@ import shapely
 from scipy.special import expit
 
 from mapfusion.arrays import Float
-from mapfusion.elements import MapElement, united
-from mapfusion.level_lines import level_polygons
+from mapfusion.elements import MapElement, united_origins
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
+from mapfusion.signed_distance import positive_areas, signed_distance
 
 CELL = 0.25
 """Side of a grid cell, metres."""
 
-TRUNCATION = 1.5
-"""Signed distances are cut off here, so that one wrong ring moves the mean little, metres."""
-
 
 @dataclass
 class _Cluster:
-    """Rings of different maps that are one crossing."""
+    """Cluster of rings of different maps that are one crossing."""
 
     rings: list[MapElement] = field(default_factory=list)
     polygons: list[shapely.Geometry] = field(default_factory=list)
@@ -94,15 +91,11 @@ def _outline(cluster: _Cluster, config: MergeConfig) -> Float | None:
     points = np.concatenate([ring.points for ring in cluster.rings])
     low = np.floor((points.min(axis=0) - 0.5) / CELL) * CELL
     shape = np.ceil((points.max(axis=0) + 0.5 - low) / CELL).astype(int)
-    x, y = np.meshgrid(*(low[k] + CELL * (np.arange(shape[k]) + 0.5) for k in range(2)), indexing="ij")
-    cells = shapely.points(x.ravel(), y.ravel())
-    total = np.zeros(x.size)
-    for ring, polygon in zip(cluster.rings, cluster.polygons, strict=True):
-        shapely.prepare(polygon)
-        distance = np.minimum(shapely.distance(shapely.boundary(polygon), cells), TRUNCATION)
-        sign = np.where(shapely.contains_xy(polygon, x.ravel(), y.ravel()), 1.0, -1.0)
-        total += float(information(ring, config).mean()) * sign * distance
-    polygons = level_polygons(total.reshape(x.shape), 0.0)
+    x, y = (low[axis] + CELL * (np.arange(shape[axis]) + 0.5) for axis in range(2))
+    total = np.zeros(shape)
+    for ring in cluster.rings:
+        total += float(information(ring, config).mean()) * signed_distance(x, y, ring.points)
+    polygons = positive_areas(total)
     if not polygons:
         return None
     outline = shapely.get_coordinates(polygons[0]) * CELL + low + 0.5 * CELL
@@ -121,4 +114,4 @@ def _element(cluster: _Cluster, outline: Float, sure: float, config: MergeConfig
         first_seen=min(ring.first_seen for ring in cluster.rings),
         last_seen=max(ring.last_seen for ring in cluster.rings),
         deviation=np.full(len(outline), 1.0 / np.sqrt(weight)),
-    ).with_origins(united(ring.origins for ring in cluster.rings))
+    ).with_origins(united_origins(ring.origins for ring in cluster.rings))

@@ -1,4 +1,4 @@
-"""Square tiles: which there are, lines cut at their sides, and the pieces put together again."""
+"""Square tiles: lines cut at their sides, and the parts stitched together again."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mapfusion.arrays import Float
-from mapfusion.elements import ElementKind, Origins, united
+from mapfusion.elements import ElementKind, Origins, united_origins
 
 SEAM = 1.0
-"""Ends on the common side of two tiles that lie this close are one place, metres."""
+"""Distance up to which two ends on the common side of two tiles are one place, metres."""
 
 SEAM_COSINE = np.cos(np.radians(40.0))
-"""Lines go on across a side without turning more than this."""
+"""Cosine of the largest turn of a line across a side."""
 
-SAME_PLACE = 0.1
-"""Unless their ends are one point, to within this distance, metres."""
+ONE_POINT = 0.1
+"""Distance up to which two ends are one point, and a larger turn is allowed, metres."""
 
 ON_SIDE = 1e-6
+"""Distance up to which a point lies on a side, metres."""
 
 
 @dataclass(frozen=True, order=True)
 class Tile:
-    """A square of the plane.
+    """Square of the plane.
 
     Attributes:
         row, column: its place; row counts northwards.
@@ -105,10 +106,10 @@ def cut_line(points: Float, values: Float, low: Float, high: Float) -> list[tupl
 
 @dataclass
 class MergedLine:
-    """A line of the merged map, whole or cut at a tile's side.
+    """Line of the merged map, whole or cut at a tile's side.
 
     Attributes:
-        kind: what it is.
+        kind: divider or boundary.
         points: ``(n, 2)``, metres.
         values: ``(n, 2)``: variance across the line, m², and log-odds of existence.
         observations: frames that saw it, by source.
@@ -134,7 +135,7 @@ class MergedLine:
         return replace(self, points=points, values=values)
 
     def joined(self, other: MergedLine) -> MergedLine:
-        """Return this piece with another put to its end, their common point in the middle."""
+        """Return this line with another put to its end, their common point in the middle."""
         points = np.concatenate([self.points, other.points[1:]])
         values = np.concatenate([self.values, other.values[1:]])
         seam = len(self.points) - 1
@@ -143,16 +144,16 @@ class MergedLine:
         return self.with_evidence_of(other, points, values)
 
     def with_evidence_of(self, other: MergedLine, points: Float, values: Float) -> MergedLine:
-        """Return the line that this piece and another are parts of."""
+        """Return the line that this one and another are parts of."""
         counts = dict(self.observations)
         for source, count in other.observations.items():
             counts[source] = max(counts.get(source, 0), count)
         first, last = min(self.first_seen, other.first_seen), max(self.last_seen, other.last_seen)
-        return MergedLine(self.kind, points, values, counts, first, last, united([self.origins, other.origins]))
+        return MergedLine(self.kind, points, values, counts, first, last, united_origins([self.origins, other.origins]))
 
 
 class Stitcher:
-    """Takes the pieces of tile after tile, in ascending order, and gives back lines that are whole.
+    """Stitcher of the lines of tile after tile, in ascending order; gives back lines that are whole.
 
     Holds only what ends at a side whose other tile is still to come.
     """
@@ -161,39 +162,39 @@ class Stitcher:
         self._waiting = set(tiles)
         self._open: list[MergedLine] = []
 
-    def add(self, tile: Tile, pieces: list[MergedLine]) -> Iterator[MergedLine]:
-        """Take the pieces of one tile, cut at its sides, and yield the lines that no other tile can lengthen."""
+    def add(self, tile: Tile, lines: list[MergedLine]) -> Iterator[MergedLine]:
+        """Take the lines of one tile, cut at its sides, and yield those that no other tile can lengthen."""
         self._waiting.discard(tile)
-        for piece in pieces:
-            self._open.append(self._grown(tile, piece))
+        for line in lines:
+            self._open.append(self._grown(tile, line))
         still_open = []
-        for piece in self._open:
-            if any(self._touches(piece.points[end]) for end in (0, -1)):
-                still_open.append(piece)
+        for line in self._open:
+            if any(self._touches(line.points[end]) for end in (0, -1)):
+                still_open.append(line)
             else:
-                yield piece
+                yield line
         self._open = still_open
 
     def rest(self) -> Iterator[MergedLine]:
-        """Yield what is left when all tiles have come."""
+        """Yield the remaining lines, after the last tile."""
         yield from self._open
         self._open = []
 
-    def _grown(self, tile: Tile, piece: MergedLine) -> MergedLine:
-        """Join a piece to the open ones that it continues, at either end."""
+    def _grown(self, tile: Tile, line: MergedLine) -> MergedLine:
+        """Return a line joined to the open ones that it continues, at either end."""
         for _ in range(2):
-            if tile.beyond(piece.points[0]) is not None:
+            if tile.beyond(line.points[0]) is not None:
                 best: tuple[float, int, bool] | None = None
                 for place, other in enumerate(self._open):
                     for turned in (False, True):
-                        gap = _seam_gap(other.reversed() if turned else other, piece)
+                        gap = _seam_gap(other.reversed() if turned else other, line)
                         if gap is not None and (best is None or gap < best[0]):
                             best = (gap, place, turned)
                 if best is not None:
                     other = self._open.pop(best[1])
-                    piece = (other.reversed() if best[2] else other).joined(piece)
-            piece = piece.reversed()
-        return piece
+                    line = (other.reversed() if best[2] else other).joined(line)
+            line = line.reversed()
+        return line
 
     def _touches(self, point: Float) -> bool:
         """Whether a point lies on a side of a tile that is still to come."""
@@ -207,7 +208,7 @@ class Stitcher:
 
 
 def _seam_gap(before: MergedLine, after: MergedLine) -> float | None:
-    """Return the distance from the end of one piece to the start of another that goes on from it, else None."""
+    """Return the distance from the end of one line to the start of another that goes on from it, else None."""
     if before.kind is not after.kind:
         return None
     gap = after.points[0] - before.points[-1]
@@ -218,5 +219,5 @@ def _seam_gap(before: MergedLine, after: MergedLine) -> float | None:
     arrive = after.points[min(3, len(after.points) - 1)] - after.points[0]
     size = float(np.hypot(*leave) * np.hypot(*arrive))
     # a corner may lie on the side itself; a line beside it may not be taken for the other leg
-    straight = -0.5 if distance < SAME_PLACE else SEAM_COSINE
+    straight = -0.5 if distance < ONE_POINT else SEAM_COSINE
     return distance if size > 0 and leave @ arrive > straight * size else None

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from mapfusion import RegionOfInterest
 from mapfusion.geometry import arc_length, chamfer_distance, clip_line, inverse_pose, resample, transform_points
-from mapfusion.level_lines import level_polygons
 from mapfusion.line_repair import repaired_rows
+from mapfusion.signed_distance import positive_areas
 from tests.mapfusion.simulation import pose
 
 coordinate = st.floats(-100, 100, width=32)
@@ -66,7 +66,7 @@ def test_chamfer_distance_is_symmetric_and_zero_for_the_same_points(first, secon
 @given(st.floats(4, 12), st.floats(4, 12), st.floats(0, 3))
 def test_the_outline_of_a_disc_is_a_circle(x, y, phase):
     rows, columns = np.meshgrid(np.arange(17.0), np.arange(17.0), indexing="ij")
-    outlines = level_polygons(3.0 + phase - np.hypot(rows - x, columns - y), 0.0)
+    outlines = positive_areas(3.0 + phase - np.hypot(rows - x, columns - y))
     assert outlines[0].is_valid
     assert outlines[0].area == pytest.approx(np.pi * (3.0 + phase) ** 2, rel=0.06) or 3.0 + phase > 4.0
 
