@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
-from mapfusion.formats.geojson import DECIMALS
+from mapfusion.formats.geojson import geometry_of
 from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
@@ -142,7 +142,7 @@ def diff_maps(
     if config.align and len(old) and len(new):
         alignment = align(landmarks(new), landmarks(old))
         if alignment.certain:
-            new = _moved(new, alignment)
+            new = new.moved(alignment.apply)
             ground = shapely.transform(ground, alignment.apply)
     differences: list[Difference] = []
     for kind in ElementKind:
@@ -158,6 +158,7 @@ def write_diff(
     """Write a diff as GeoJSON: LineStrings (crossings Polygons) with ``change``, ``kind``, ``length_m``, ``moved_m``.
 
     Raises:
+        ValueError: coordinates that are not on the globe.
         OSError: the file cannot be written.
     """
     features = [_feature(item, georeference) for item in difference.differences]
@@ -167,16 +168,6 @@ def write_diff(
 
 
 def _feature(item: Difference, georeference: Georeference) -> dict[str, Any]:
-    degrees = np.round(georeference.to_wgs84(item.points), DECIMALS)
-    if item.kind.is_ring:
-        degrees[-1] = degrees[0]
-        if not shapely.LinearRing(degrees).is_ccw:
-            degrees = degrees[::-1]
-    geometry = (
-        {"type": "Polygon", "coordinates": [degrees.tolist()]}
-        if item.kind.is_ring
-        else {"type": "LineString", "coordinates": degrees.tolist()}
-    )
     properties = {
         "change": item.change.value,
         "kind": item.kind.label,
@@ -184,12 +175,8 @@ def _feature(item: Difference, georeference: Georeference) -> dict[str, Any]:
         "moved_m": None if np.isnan(item.moved_by) else round(item.moved_by, 3),
         "confidence": round(item.confidence, 4),
     }
+    geometry, _ = geometry_of(item.kind, item.points, georeference)
     return {"type": "Feature", "geometry": geometry, "properties": properties}
-
-
-def _moved(global_map: GlobalMap, alignment: Alignment) -> GlobalMap:
-    elements = tuple(replace(element, points=alignment.apply(element.points)) for element in global_map)
-    return GlobalMap(elements, global_map.provenance)
 
 
 def _compare_lines(

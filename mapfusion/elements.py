@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Any, TypeAlias
@@ -204,6 +204,11 @@ class GlobalMap:
     def of_kind(self, kind: ElementKind) -> tuple[MapElement, ...]:
         """Return the elements of one kind, in map order."""
         return tuple(element for element in self.elements if element.kind == kind)
+
+    def moved(self, motion: Callable[[Float], Float]) -> GlobalMap:
+        """Return the map with a motion of points ``(n, 2)`` applied to all elements."""
+        elements = tuple(replace(element, points=motion(element.points)) for element in self)
+        return GlobalMap(elements, self.provenance)
 
     def length(self, kind: ElementKind) -> float:
         """Total length of one kind, metres."""

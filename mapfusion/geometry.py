@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import shapely
 from scipy.spatial import cKDTree
 
 from mapfusion.arrays import Float, Integer
@@ -120,6 +121,13 @@ def inverse_pose(a_to_b: Float) -> Float:
     b_to_a[:3, :3] = a_to_b[:3, :3].T
     b_to_a[:3, 3] = -a_to_b[:3, :3].T @ a_to_b[:3, 3]
     return b_to_a
+
+
+def simplified_rows(points: Float, tolerance: float) -> Integer:
+    """Return the rows of a line ``(n, 2)`` that stay when it is simplified to within ``tolerance``, metres."""
+    simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), tolerance))
+    row_of = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
+    return np.array([row_of[point] for point in map(tuple, simple.tolist())], dtype=np.int64)
 
 
 def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:

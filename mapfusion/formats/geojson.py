@@ -174,23 +174,25 @@ def parse_timestamp(text: str) -> int:
     return (moment.days * 86_400 + moment.seconds) * 1_000_000_000 + int(match[2])
 
 
+def geometry_of(kind: ElementKind, points: Float, georeference: Georeference) -> tuple[dict[str, Any], bool]:
+    """Return the GeoJSON geometry of a line or ring, metres, and whether the ring was turned; ValueError off the globe.
+
+    Rings turn counter-clockwise.
+    """
+    degrees = np.round(georeference.to_wgs84(points), DECIMALS)
+    if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
+        raise ValueError(f"a {kind.label} lies outside the globe: the georeference does not fit the map")
+    if not kind.is_ring:
+        return {"type": "LineString", "coordinates": degrees.tolist()}, False
+    degrees[-1] = degrees[0]
+    x, y = (degrees - degrees[0]).T
+    turned = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0
+    return {"type": "Polygon", "coordinates": [degrees[:: -1 if turned else 1].tolist()]}, turned
+
+
 def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any]:
     """Return an element as a GeoJSON feature, which every format writes; raises ValueError off the globe."""
-    degrees = np.round(georeference.to_wgs84(element.points), DECIMALS)
-    if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
-        raise ValueError(f"a {element.kind.label} lies outside the globe: the georeference does not fit the map")
-    deviation = element.deviation
-    if element.kind.is_ring:
-        degrees[-1] = degrees[0]
-        x, y = (degrees - degrees[0]).T
-        if float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0:
-            degrees = degrees[::-1]
-            deviation = None if deviation is None else deviation[::-1]
-    geometry = (
-        {"type": "Polygon", "coordinates": [degrees.tolist()]}
-        if element.kind.is_ring
-        else {"type": "LineString", "coordinates": degrees.tolist()}
-    )
+    geometry, turned = geometry_of(element.kind, element.points, georeference)
     properties: dict[str, Any] = {
         "kind": element.kind.label,
         "confidence": round(element.confidence, 4),
@@ -200,8 +202,8 @@ def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any
         "track_ids": list(element.track_ids),
         "length_m": round(element.length, 3),
     }
-    if deviation is not None:
-        properties["deviation_m"] = np.round(deviation, 3).tolist()
+    if element.deviation is not None:
+        properties["deviation_m"] = np.round(element.deviation[:: -1 if turned else 1], 3).tolist()
     if element.sources:
         properties["sources"] = list(element.sources)
         if element.source_track_ids:

@@ -10,9 +10,9 @@ import shapely
 from scipy.linalg import solveh_banded
 from scipy.special import expit
 
-from mapfusion.arrays import Bool, Float, Integer
+from mapfusion.arrays import Bool, Float
 from mapfusion.elements import ElementKind, MapElement
-from mapfusion.geometry import arc_length
+from mapfusion.geometry import arc_length, simplified_rows
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.evidence import Evidence
 from mapfusion.integrate.fused_line import FusedLine
@@ -57,9 +57,9 @@ def line_elements(
             continue
         if closes(points[rows]):
             rows = np.append(rows, rows[0])
-        part, kept = _simplify(points[rows], config.simplify_tolerance)
+        rows = rows[simplified_rows(points[rows], config.simplify_tolerance)]
         sure = float(expit(odds[start:stop]).mean())
-        elements.append(_element(line.kind, part, sure, line.evidence, deviation[rows][kept], logs))
+        elements.append(_element(line.kind, points[rows], sure, line.evidence, deviation[rows], logs))
     return elements
 
 
@@ -133,13 +133,6 @@ def _unfolded(points: Float, start: int, stop: int) -> list[tuple[int, int]]:
     """Cut a stretch where it turns back on itself."""
     edges = [start, *(start + tip for tip in hairpins(points[start:stop])), stop]
     return [(a, min(b + 1, stop)) for a, b in pairwise(edges)]
-
-
-def _simplify(points: Float, tolerance: float) -> tuple[Float, Integer]:
-    """Simplify a line; returns its points and which of the given ones they are."""
-    simple = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), tolerance))
-    lookup = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
-    return simple, np.array([lookup[point] for point in map(tuple, simple.tolist())], dtype=np.int64)
 
 
 def _element(

@@ -20,6 +20,7 @@ from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.geometry import simplified_rows
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, ground_within, rings_around
 from mapfusion.line_repair import repaired_rows
@@ -80,8 +81,7 @@ class _MapCache:
         correction = self.corrections.get(place)
         if correction is None:
             return raw, ground
-        moved = tuple(replace(element, points=correction.apply(element.points)) for element in raw)
-        return GlobalMap(moved, raw.provenance), shapely.transform(ground, correction.apply)
+        return raw.moved(correction.apply), shapely.transform(ground, correction.apply)
 
 
 _cache: _MapCache
@@ -257,33 +257,30 @@ class _Merge:
         stitcher = Stitcher(tiles)
         tasks = [(tile, members[tile], self.names, self.config) for tile in tiles]
         results = self._each(_fuse_tile, _fuse_in_worker, tasks, jobs)
-        for done, (tile, (pieces, rings)) in enumerate(zip(tiles, results, strict=True), start=1):
-            for piece in stitcher.add(tile, pieces):
-                yield from self._finished(piece)
+        for done, (tile, (lines, rings)) in enumerate(zip(tiles, results, strict=True), start=1):
+            for line in stitcher.add(tile, lines):
+                yield from self._finished(line)
             yield from rings
             say(done, len(tiles), "merging tiles")
-        for piece in stitcher.rest():
-            yield from self._finished(piece)
+        for line in stitcher.rest():
+            yield from self._finished(line)
 
-    def _finished(self, piece: MergedLine) -> Iterator[MapElement]:
-        rows = repaired_rows(piece.points)
-        points, values = piece.points[rows], piece.values[rows]
-        line = shapely.LineString(points) if len(rows) > 1 else None
-        if line is None or line.length < self.config.min_length:
+    def _finished(self, line: MergedLine) -> Iterator[MapElement]:
+        rows = repaired_rows(line.points)
+        points, values = line.points[rows], line.values[rows]
+        if len(rows) < 2 or shapely.LineString(points).length < self.config.min_length:
             return
-        simple = shapely.get_coordinates(shapely.simplify(line, self.config.simplify_tolerance))
-        row_of = {point: row for row, point in enumerate(map(tuple, points.tolist()))}
-        deviation = np.sqrt(values[[row_of[point] for point in map(tuple, simple.tolist())], 0])
+        kept = simplified_rows(points, self.config.simplify_tolerance)
         element = MapElement(
-            kind=piece.kind,
-            points=simple,
+            kind=line.kind,
+            points=points[kept],
             confidence=float(expit(np.clip(values[:, 1], -6.0, 6.0)).mean()),
-            observations=sum(piece.observations.values()),
-            first_seen=piece.first_seen,
-            last_seen=piece.last_seen,
-            deviation=deviation,
+            observations=sum(line.observations.values()),
+            first_seen=line.first_seen,
+            last_seen=line.last_seen,
+            deviation=np.sqrt(values[kept, 0]),
         )
-        yield element.with_origins(piece.origins)
+        yield element.with_origins(line.origins)
 
     def _each(self, direct: Any, in_worker: Any, tasks: Sequence[Any], jobs: int) -> Iterator[Any]:
         """Do the tasks here or in processes, results in order."""
@@ -346,7 +343,7 @@ def _fuse_tile(
         global_map, ground = cache.corrected(place)
         around = Looks(part for element in global_map for part in _in_box(element, low, high))
         loaded.append((place, global_map, ground, around))
-    pieces: list[MergedLine] = []
+    lines: list[MergedLine] = []
     rings: list[MapElement] = []
     for kind in ElementKind:
         contributions = []
@@ -357,10 +354,10 @@ def _fuse_tile(
         if kind.is_ring:
             rings.extend(ring for ring in fuse_rings(contributions, config) if _owns(tile, ring))
             continue
-        for piece in fuse_lines(kind, contributions, config):
-            for points, values in cut_line(piece.points, piece.values, tile.low, tile.high):
-                pieces.append(replace(piece, points=points, values=values))
-    return pieces, rings
+        for line in fuse_lines(kind, contributions, config):
+            for points, values in cut_line(line.points, line.values, tile.low, tile.high):
+                lines.append(replace(line, points=points, values=values))
+    return lines, rings
 
 
 def _named(element: MapElement, name: str) -> MapElement:
