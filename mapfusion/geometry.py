@@ -10,7 +10,7 @@ from mapfusion.arrays import Float, Integer
 from mapfusion.elements import RegionOfInterest
 
 UNIT_TOLERANCE = 1e-14
-"""A squared quaternion length this close to 1 is 1."""
+"""Distance from 1 up to which a squared quaternion length counts as 1."""
 
 
 def arc_length(points: Float) -> Float:

@@ -8,7 +8,7 @@ from mapfusion.arrays import Float
 
 
 class Georeference(Protocol):
-    """The way from a metric global frame to WGS84; used where maps are written."""
+    """Georeference of a metric frame: the way to WGS84, used where maps are written."""
 
     @property
     def name(self) -> str:
@@ -21,7 +21,7 @@ class Georeference(Protocol):
 
 
 class InvertibleGeoreference(Georeference, Protocol):
-    """A georeference that also leads back."""
+    """Georeference that also leads back."""
 
     def from_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""

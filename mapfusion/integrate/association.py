@@ -25,12 +25,12 @@ MATCH_REACH = 1.5
 """Single stations are compared up to this multiple of the match distance, which bounds their mean."""
 
 TAKEN_SHARE = 0.3
-"""An observation may share at most this part of its stretch of an element with others of its frame."""
+"""Share of a stretch of an element from which on it counts as taken by other observations of the frame."""
 
 
 @dataclass(frozen=True)
 class LineCandidate:
-    """An element that an observation lies beside.
+    """Candidate element that an observation lies beside.
 
     Attributes:
         element: its id.

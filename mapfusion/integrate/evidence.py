@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 Track: TypeAlias = tuple[int, int]
-"""A track of a drive: number of the log, id within it. Different logs count their tracks from the same number."""
+"""Track of a drive: number of the drive, id within it; the ids of two drives may be equal."""
 
 
 @dataclass

@@ -114,8 +114,8 @@ def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
 def _supported(odds: Float, weak: float) -> Bool:
     """Return which stations exist: more likely than not, or weaker but connected to such ones (hysteresis)."""
     strong, possible = odds > 0.0, odds > weak
-    piece = np.cumsum(np.diff(possible, prepend=False))
-    return np.asarray(possible & np.isin(piece, piece[strong]))
+    stretch = np.cumsum(np.diff(possible, prepend=False))
+    return np.asarray(possible & np.isin(stretch, stretch[strong]))
 
 
 def _stretches(alive: Bool, gap: int) -> list[tuple[int, int]]:

@@ -18,7 +18,7 @@ BLEND_LENGTH = 10.0
 """Decay length, past the common stretch, of the shift that leads an extension over, metres."""
 
 END = 0.6
-"""A foot may lie this far past an end of the new curve, metres."""
+"""Distance that a foot may lie past an end of the new curve, metres."""
 
 ONES = np.ones(2)
 

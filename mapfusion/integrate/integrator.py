@@ -45,12 +45,12 @@ SHORTEST_LINE = 3
 """Leftovers of an observation with fewer vertices start no line."""
 
 SIDE_BY_SIDE = 0.25
-"""Two lines that single frames showed side by side in more than this share of their frames are not one."""
+"""Share of frames that show two lines side by side from which on they are not one line."""
 
 
 @dataclass(frozen=True)
 class _PlacedFrame:
-    """A frame and the ground around it.
+    """Frame with the ground around it.
 
     Attributes:
         frame_map: the frame.
@@ -113,7 +113,7 @@ class MapIntegrator:
 
     @property
     def rejections(self) -> Counter[str]:
-        """What was left out, counted by reason."""
+        """Number of frames and elements left out, by reason."""
         return self.state.rejections
 
     @property

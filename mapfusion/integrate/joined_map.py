@@ -63,9 +63,9 @@ class JoinedMap:
         changed = [number for number in self._changed if number in self._extracted]
         tips = np.concatenate([np.zeros((0, 2)), *(self._extracted[number][1].tip for number in changed)])
         around = sorted(self._tips.around(tips, config.join_gap))
-        pieces = [self._extracted[number] for number in around]
-        owner = np.repeat(around, [len(elements) for elements, _ in pieces]).tolist()
-        for link in links_between(_elements(pieces), all_ends(pieces), views, config):
+        several = [self._extracted[number] for number in around]
+        owner = np.repeat(around, [len(elements) for elements, _ in several]).tolist()
+        for link in links_between(_elements(several), all_ends(several), views, config):
             one, two = (owner[element] for element, _ in link.ends)
             if one in self._changed or two in self._changed:
                 self._linked.setdefault(one, set()).add(two)
@@ -86,13 +86,13 @@ class JoinedMap:
         for number in numbers:
             self._joined.pop(number, None)
         present = sorted(number for number in numbers if number in self._extracted)
-        pieces = [self._extracted[number] for number in present]
-        owner = np.repeat(present, [len(elements) for elements, _ in pieces]).tolist()
-        elements = _elements(pieces)
-        links = links_between(elements, all_ends(pieces), views, config)
+        several = [self._extracted[number] for number in present]
+        owner = np.repeat(present, [len(elements) for elements, _ in several]).tolist()
+        elements = _elements(several)
+        links = links_between(elements, all_ends(several), views, config)
         for first, element in joined_along(elements, links):
             self._joined.setdefault(owner[first], []).append(element)
 
 
-def _elements(pieces: list[tuple[list[MapElement], Ends]]) -> list[MapElement]:
-    return [element for elements, _ in pieces for element in elements]
+def _elements(several: list[tuple[list[MapElement], Ends]]) -> list[MapElement]:
+    return [element for elements, _ in several for element in elements]

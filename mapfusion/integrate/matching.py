@@ -123,7 +123,7 @@ def correspond(stations: DirectedPoints, owner: Integer, curve: DirectedPoints, 
 
 
 class _Pairs(NamedTuple):
-    """All pairs of a station and a vertex.
+    """Pairs of a station and a vertex, all with all.
 
     Attributes:
         stations: ``n`` of them.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class MapStatus:
-    """How one input map was treated.
+    """Treatment of one input map.
 
     Attributes:
         name: of the map.

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator
 from mapfusion.geometry import transform_points
 from mapfusion.ground import CameraSector, frame_ground, ground_within, seen_along, visible_ground
+from tests.mapfusion.integrate.test_integrator_properties import frame_map, integrate
 from tests.mapfusion.map_quality import dense, nearest
 from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, ROI, Detector, element, pose, simulate
-from tests.mapfusion.test_integrator_properties import frame_map, integrate
 
 ROAD = GlobalMap(
     (

@@ -16,9 +16,9 @@ from mapfusion.ground import CameraSector, visible_ground
 from mapfusion.integrate.joined_map import JoinedMap
 from mapfusion.integrate.views import ViewGrid
 from mapfusion.line_repair import hairpins
+from tests.mapfusion.integrate.test_integrator_properties import frame_map, integrate
 from tests.mapfusion.map_quality import dense, faults, nearest
 from tests.mapfusion.simulation import ROI, pose, town_drive
-from tests.mapfusion.test_integrator_properties import frame_map, integrate
 
 CONFIG = IntegratorConfig()
 DIVIDER, BOUNDARY = ElementKind.DIVIDER, ElementKind.BOUNDARY

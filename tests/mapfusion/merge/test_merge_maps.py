@@ -18,9 +18,9 @@ from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Looks, certainty
 from mapfusion.merge.merge import merge_files, merge_maps
 from mapfusion.merge.report import short_names
+from tests.mapfusion.integrate.test_integrator_properties import frame_map
 from tests.mapfusion.map_quality import measure
 from tests.mapfusion.simulation import simulate, town_road
-from tests.mapfusion.test_integrator_properties import frame_map
 
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
 
