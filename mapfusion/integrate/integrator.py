@@ -67,7 +67,7 @@ class _PlacedFrame:
 
     @classmethod
     def of(cls, frame_map: FrameMap) -> _PlacedFrame:
-        car = frame_map.ego_to_global[:2, 3]
+        car = np.array(frame_map.ego_to_global[:2, 3], dtype=np.float64)
         reach = np.abs(frame_map.ego_to_global[:2, :2]) @ (frame_map.roi.size / 2) + BOX_MARGIN
         return cls(frame_map, clearly_visible(frame_map), car, car - reach, car + reach)
 
