@@ -18,7 +18,7 @@ from cli.options import (
     SplitScheme,
     Weights,
 )
-from predmapnet.precision import Precision
+from predmapnet.machine import Precision
 
 
 def batch(

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from predmapnet.precision import Precision
+from predmapnet.machine import Precision
 
 
 class Scheme(StrEnum):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
-from predmapnet.precision import Precision
+from predmapnet.machine import Precision
 
 
 def view(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mapfusion import ElementKind, MapIntegrator
 from mapfusion.formats.geojson import write_geojson
-from predmapnet.fusion import NETWORK_ERRORS
+from predmapnet.map_scene import NETWORK_ERRORS
 from predmapnet.mapper import Mapper
 from predmapnet.sources import open_source
 

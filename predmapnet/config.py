@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.datasets.cameras import NUSCENES_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 
 Positive = Annotated[int, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -7,6 +7,14 @@ import multiprocessing
 import os
 import sys
 import threading
+from enum import StrEnum
+
+
+class Precision(StrEnum):
+    """Numbers that the image backbone and the BEV encoder compute with; everything else computes in float32."""
+
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
 
 
 def use_threads(count: int) -> int:

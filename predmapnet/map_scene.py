@@ -6,15 +6,26 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+import shapely
 
 from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
+from mapfusion.ground import seen_along
+from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.errors import UserError
-from predmapnet.field_of_view import seen_in
-from predmapnet.fusion import NETWORK_ERRORS
-from predmapnet.mapper import CameraImages, Mapper
 from predmapnet.scenes import Frame, Scene
+
+if TYPE_CHECKING:  # What needs no network (runs.integrate) does not load torch.
+    from predmapnet.mapper import CameraImages, Mapper
+
+NETWORK_ERRORS = IntegratorConfig(common_deviation=0.2)
+"""Assumptions of the integrator about the networks of this package.
+
+A network with a memory repeats its error from frame to frame, so that its detections agree better with each other
+than with the truth. The common part was chosen on the validation towns of the demo world with the ``lite`` weights.
+"""
 
 MapSnapshot = Callable[[], GlobalMap]
 """Gives the global map as it is now; costs time that grows with the map, so ask seldom."""
@@ -28,11 +39,13 @@ class Step:
         frame: what the car saw.
         frame_map: what the mapper made of it, rasters included.
         milliseconds: by stage: ``images`` (waiting for them), ``network``, ``integration``.
+        fused: whether the integrator accepted the frame.
     """
 
     frame: Frame
     frame_map: FrameMap
     milliseconds: Mapping[str, float]
+    fused: bool
 
 
 class Observer(Protocol):
@@ -53,7 +66,7 @@ class Observer(Protocol):
 
 @dataclass(frozen=True)
 class SceneRun:
-    """What came of a scene.
+    """A mapped scene.
 
     Attributes:
         global_map: the map of the whole drive, without provenance.
@@ -62,6 +75,7 @@ class SceneRun:
         seconds: wall time from the first image to the last frame.
         milliseconds: mean per frame, by stage.
         rejections: what the integrator left out and why, counted by reason.
+        observed: ground that the cameras saw in the fused frames, global frame, metres.
     """
 
     global_map: GlobalMap
@@ -70,6 +84,7 @@ class SceneRun:
     seconds: float
     milliseconds: Mapping[str, float]
     rejections: Mapping[str, int]
+    observed: shapely.Geometry
 
     @property
     def frames_per_second(self) -> float:
@@ -97,11 +112,13 @@ def map_scene(
     for observer in observers:
         observer.begin(scene, mapper.roi)
     start = perf_counter()
-    frames, frame_maps, timings = [], [], []
+    frames, frame_maps, fused, timings = [], [], [], []
     for step in stream(scene, mapper, integrator, allow_missing_cameras):
         frames.append(step.frame)
         frame_maps.append(replace(step.frame_map, segmentation=None, history_masks=None))
         timings.append(step.milliseconds)
+        if step.fused:
+            fused.append(frame_maps[-1])
         for observer in observers:
             observer.observe(step, integrator.map)
     global_map = integrator.map()
@@ -109,7 +126,10 @@ def map_scene(
     for observer in observers:
         observer.end(global_map)
     means = {stage: sum(timing[stage] for timing in timings) / len(timings) for stage in timings[0]}
-    return SceneRun(global_map, tuple(frames), tuple(frame_maps), seconds, means, dict(integrator.rejections))
+    rejections = dict(integrator.rejections)
+    return SceneRun(
+        global_map, tuple(frames), tuple(frame_maps), seconds, means, rejections, observed=seen_along(fused)
+    )
 
 
 def stream(
@@ -131,8 +151,8 @@ def stream(
             if index + 1 < len(scene):
                 upcoming = reader.submit(read, index + 1)
             frame_map, state = mapper.step(frame, state, images=images)
-            frame_map = replace(frame_map, visible=seen_in(frame, mapper.roi))
             mapped = perf_counter()
+            before = integrator.frames
             integrator.add(frame_map, log=frame.scene)
             done = perf_counter()
             yield Step(
@@ -143,4 +163,5 @@ def stream(
                     "network": 1e3 * (mapped - images_ready),
                     "integration": 1e3 * (done - mapped),
                 },
+                fused=integrator.frames > before,
             )

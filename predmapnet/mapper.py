@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
+from predmapnet.machine import Precision
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.kernels.compilation import compile_features
 from predmapnet.network.kernels.inference import for_inference
@@ -24,8 +25,7 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.rig_geometry import arranged_rig
 from predmapnet.network.state import FrameInputs, Instances, RigGeometry, Selection, StreamState
 from predmapnet.network.track_selection import select
-from predmapnet.precision import Precision
-from predmapnet.scenes import Float, Frame, Image, Rig
+from predmapnet.scenes import Float, Frame, Image, Rig, ground_in_view
 from predmapnet.weights.checkpoint import load_checkpoint
 
 RIG_TOLERANCE = 1e-4
@@ -158,7 +158,8 @@ class Mapper:
             allow_missing_cameras: as in :meth:`read_images`.
 
         Returns:
-            The map of this instant, and the state for the next step. ``state`` itself is not changed.
+            The map of this instant, ``visible`` saying what ground the cameras with an image cover, and the state for
+            the next step. ``state`` itself is not changed.
 
         Raises:
             UserError: an image is missing, damaged, or not of its camera's size, or the car has other cameras than the
@@ -166,6 +167,7 @@ class Mapper:
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
+        rig = arranged_rig(frame.rig, self.config)
         inputs = FrameInputs(
             images=normalise_images(torch.from_numpy(images.windows)[None].to(self._device), self.config.image),
             camera_valid=torch.from_numpy(images.valid)[None].to(self._device),
@@ -173,13 +175,14 @@ class Mapper:
         )
         if state is None:
             state = self.network.initial_state(1)
-        outputs = self.network(inputs, self._lookup(arranged_rig(frame.rig, self.config)), state)
+        outputs = self.network(inputs, self._lookup(rig), state)
         selection = select(outputs, state, self.config)
         state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
         frame_map = to_frame_map(
             selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
         )
-        return frame_map, state
+        working = (camera for camera, valid in zip(rig, images.valid, strict=True) if valid)
+        return replace(frame_map, visible=ground_in_view(working, self.roi)), state
 
     def _lookup(self, rig: Rig) -> RigGeometry:
         """Return the look-up of a rig, from the few that were used last."""

@@ -23,7 +23,8 @@ from predmapnet.config import (
     TrackingConfig,
     WholeImageConfig,
 )
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 
 

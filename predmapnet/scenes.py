@@ -1,4 +1,4 @@
-"""The protocol of every source of driving logs: a source lists scenes, a scene yields frames."""
+"""Driving logs: cameras, frames, scenes and their sources."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
+from mapfusion.georeference import Georeference
+from mapfusion.ground import CameraSector, ground_within, region, rings_around, visible_ground
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Progress = Callable[[int, int, str], None]
-"""Called as ``progress(done, total, what)`` while something long is prepared."""
+"""Callback ``progress(done, total, what)`` of a long preparation."""
+
+NARROW_GAP = 4.0
+"""Gaps between neighbouring cameras narrower than this, metres, count as seen from either side."""
+
+WHOLE = 0.99
+"""Share of the region from which on all of it counts as seen."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +49,27 @@ class Camera:
     camera_to_ego: Float
     ground_height: float = 0.0
 
+    @property
+    def sector(self) -> CameraSector:
+        """The horizontal sector of the ground that the camera covers, ego frame."""
+        focal, centre = self.intrinsics[0, 0], self.intrinsics[0, 2]
+        left, right = np.arctan2(centre, focal), np.arctan2(self.width - centre, focal)
+        axis = self.camera_to_ego[:2, 2]
+        heading = np.arctan2(axis[1], axis[0]) + (left - right) / 2
+        return CameraSector(self.camera_to_ego[:2, 3], float(heading), float(left + right))
+
 
 Rig = tuple[Camera, ...]
+
+
+def ground_in_view(cameras: Iterable[Camera], roi: RegionOfInterest) -> tuple[Float, ...] | None:
+    """Return the ground that cameras cover, as ``FrameMap.visible``: rings ``(n, 2)``, or None for all of the ROI."""
+    ground = ground_within(visible_ground(roi, [camera.sector for camera in cameras]))
+    closed = shapely.buffer(shapely.buffer(ground, NARROW_GAP / 2, quad_segs=2), -NARROW_GAP / 2, quad_segs=2)
+    whole = region(roi)
+    if shapely.intersection(closed, whole).area >= WHOLE * whole.area:
+        return None
+    return tuple(rings_around(closed))
 
 
 @dataclass(frozen=True)
@@ -118,19 +146,6 @@ class SceneInfo:
     location: str
     ready: bool = True
     description: str = ""
-
-
-class Georeference(Protocol):
-    """From the metric global frame to WGS84; used by exporters only."""
-
-    @property
-    def name(self) -> str:
-        """What the frame is called."""
-        ...
-
-    def to_wgs84(self, points: Float) -> Float:
-        """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
-        ...
 
 
 class Scene(Protocol):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.argoverse2_files import (
+    ARGOVERSE2_CAMERAS,
     POSES,
     city,
     every_sweep,
@@ -27,7 +28,6 @@ from predmapnet.datasets.argoverse2_frames import (
     strided_over_time,
     sweeps_with_images,
 )
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths

@@ -11,13 +11,22 @@ import orjson
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, feather
 
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.splits import SPLITS
 from predmapnet.errors import UserError
 
 Integer = NDArray[np.int64]
 
 POSES = "city_SE3_egovehicle.feather"
+ARGOVERSE2_CAMERAS = (
+    "ring_front_center",
+    "ring_front_right",
+    "ring_front_left",
+    "ring_rear_right",
+    "ring_rear_left",
+    "ring_side_right",
+    "ring_side_left",
+)
+"""The cameras in the order of the official vector-map data sets."""
 SWEEP_LIST = "lidar_timestamps_ns.json"
 
 

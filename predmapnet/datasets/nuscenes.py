@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
-from predmapnet.datasets.cameras import NUSCENES_CAMERAS
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_nuscenes_sweep
-from predmapnet.datasets.nuscenes_tables import LIDAR, Record, Tables
+from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Record, Tables
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError

@@ -21,6 +21,8 @@ from predmapnet.errors import UserError
 
 Record = dict[str, Any]
 LIDAR = "LIDAR_TOP"
+NUSCENES_CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
+"""The cameras in the order of the official vector-map data sets."""
 
 _KEY_FRAME = (b'"is_key_frame": true', b'"is_key_frame":true')
 _SAMPLE_TOKEN = re.compile(rb'"sample_token"\s*:\s*"([^"]*)"')

@@ -27,8 +27,7 @@ import orjson
 import predmapnet
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_whole
-from predmapnet.machine import end_with_parent, use_threads
-from predmapnet.precision import Precision
+from predmapnet.machine import Precision, end_with_parent, use_threads
 from predmapnet.runs.outputs import Outputs
 
 if TYPE_CHECKING:

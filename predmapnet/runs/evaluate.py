@@ -20,8 +20,8 @@ from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
 from predmapnet.frame_files.parquet import read_frames, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
-from predmapnet.fusion import NETWORK_ERRORS
 from predmapnet.machine import use_threads
+from predmapnet.map_scene import NETWORK_ERRORS
 from predmapnet.scenes import Instant, Progress, Scene, SceneSource
 from predmapnet.sources import open_source
 

@@ -23,9 +23,9 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, threshol
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.frame_files.parquet import FrameWriter
+from predmapnet.machine import Precision
 from predmapnet.map_scene import MapSnapshot, Observer, SceneRun, Step, map_scene
 from predmapnet.mapper import Mapper
-from predmapnet.precision import Precision
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
 from predmapnet.runs.outputs import Outputs
 from predmapnet.scenes import Progress, Scene, SceneSource
@@ -177,8 +177,7 @@ class MappingPipeline:
                 observers.append(_ProgressObserver(progress))
             run = map_scene(scene, self.mapper, observers, self._allow_missing_cameras)
             if outputs.map is not None:
-                seen = seen_area([frame.ego_to_global for frame in run.frames], self.mapper.roi)
-                observed = observed_rings(seen, georeference)
+                observed = observed_rings(run.observed, georeference)
                 write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
             if outputs.frames is not None:
                 with FrameWriter(outputs.frames, provenance) as writer:

@@ -13,12 +13,12 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
-from mapfusion.ground import frame_ground
+from mapfusion.ground import seen_along
 from predmapnet.errors import UserError
 from predmapnet.frame_files.parquet import read_frames, refuse_pickle
 from predmapnet.frame_files.pose_file import FramePose, read_poses
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
-from predmapnet.fusion import NETWORK_ERRORS
+from predmapnet.map_scene import NETWORK_ERRORS
 
 Float = NDArray[np.float64]
 
@@ -108,14 +108,14 @@ def integrate(frames: Iterable[LoggedFrame]) -> Integration:
     if not ordered:
         raise UserError("there is no frame to integrate")
     integrator = MapIntegrator(NETWORK_ERRORS)
-    grounds = []
+    fused = []
     for frame in ordered:
         before = integrator.frames
         integrator.add(frame.frame_map, frame.log)
         if integrator.frames > before:
-            grounds.append(frame_ground(frame.frame_map))
+            fused.append(frame.frame_map)
     logs = tuple(dict.fromkeys(frame.log for frame in ordered))
-    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), shapely.union_all(grounds))
+    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), seen_along(fused))
 
 
 def _read_json(path: Path) -> dict[str, SubmittedFrame]:

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import PRESETS, preset

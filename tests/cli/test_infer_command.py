@@ -14,7 +14,7 @@ import torch
 from rerun.chunk import RrdReader
 
 from mapfusion.formats.by_suffix import read_map
-from predmapnet.datasets.cameras import NUSCENES_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.weights.checkpoint import save_checkpoint
 from predmapnet.weights.files import weights_hash

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.datasets.cameras import NUSCENES_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.mapper import Mapper

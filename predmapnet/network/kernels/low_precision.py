@@ -10,10 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from predmapnet.machine import Precision
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.maptracker.bevformer import BevSelfAttention, ImageCrossAttention
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.precision import Precision
 
 
 def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:

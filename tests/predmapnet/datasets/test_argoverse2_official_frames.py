@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS as CAMERAS
 from predmapnet.datasets.argoverse2_files import POSES
 from predmapnet.datasets.argoverse2_frames import (
     IMAGE_TOLERANCE,
@@ -13,7 +14,6 @@ from predmapnet.datasets.argoverse2_frames import (
     strided_over_time,
     sweeps_with_images,
 )
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS as CAMERAS
 from predmapnet.datasets.splits import split_names
 from predmapnet.errors import UserError
 

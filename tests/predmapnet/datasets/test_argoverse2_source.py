@@ -10,7 +10,7 @@ from pyarrow import feather
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets.argoverse2 import Argoverse2Source
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS as CAMERAS
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS as CAMERAS
 from predmapnet.errors import UserError
 
 SWEEP = 100_000_000

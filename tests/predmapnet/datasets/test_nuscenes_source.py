@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.datasets.cameras import NUSCENES_CAMERAS as CAMERAS
 from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS as CAMERAS
 from predmapnet.datasets.splits import split_names
 from predmapnet.errors import UserError
 

@@ -11,7 +11,6 @@ from shapely import Polygon, box
 from mapfusion.elements import RegionOfInterest
 from predmapnet.demo_world.av2_dressing import read_log
 from predmapnet.demo_world.catalogue import build_world
-from predmapnet.demo_world.occlusion import hidden_share
 from predmapnet.demo_world.render.lidar import RANGE, scan
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG
@@ -19,6 +18,7 @@ from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.street.traffic import footprint
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Look, Trajectory, VectorMap
 from predmapnet.scenes import Camera
+from tests.predmapnet.demo_world.occlusion import hidden_share
 
 SMALL_RIG = tuple(
     Camera(camera.name, 256, 144, np.diag([0.32, 0.32, 1.0]) @ camera.intrinsics, camera.camera_to_ego)

@@ -8,7 +8,7 @@ import pytest
 from mapfusion.elements import ElementKind
 from predmapnet.evaluation.frames import simplified
 from predmapnet.evaluation.raster_ap import raster_from_matches, raster_matches
-from predmapnet.evaluation.segmentation_iou import segmentation_iou
+from tests.predmapnet.evaluation.segmentation_iou import segmentation_iou
 
 OFFICIAL_ORDER = {
     "official_line": (ElementKind.DIVIDER, ElementKind.BOUNDARY),

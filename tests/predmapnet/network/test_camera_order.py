@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from predmapnet.datasets.cameras import ARGOVERSE2_CAMERAS, NUSCENES_CAMERAS
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.network.camera_order import in_learned_order

@@ -5,11 +5,11 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.machine import Precision
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
-from predmapnet.precision import Precision
 from tests.predmapnet.network.conftest import SMALL
 from tests.predmapnet.network.small_baseline import frames, small_config, small_network, small_pillars
 
