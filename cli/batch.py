@@ -18,7 +18,7 @@ from cli.options import (
     SplitScheme,
     Weights,
 )
-from predmapnet.machine import Precision
+from predmapnet.machine import NetworkOptions, Precision, available_cores
 
 
 def batch(
@@ -45,7 +45,6 @@ def batch(
     scene failed.
     """
     from cli.console import err, progress_display, say_outcomes
-    from predmapnet.machine import available_cores
     from predmapnet.runs.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
     from predmapnet.sources import open_source
     from predmapnet.weights.files import weights_hash
@@ -60,14 +59,11 @@ def batch(
     settings = BatchSettings(
         source.name,
         source.root,
-        weights,
-        device,
+        NetworkOptions(weights, device, precision, compiled),
         allow_missing_cameras,
         recordings,
         save_frames,
         threads=max(1, available_cores() // jobs),
-        precision=precision,
-        compiled=compiled,
     )
     journal = BatchJournal(out)
     with progress_display() as display:

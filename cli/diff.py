@@ -28,15 +28,13 @@ def diff(
     from cli.console import out as screen
     from mapfusion.diff import DiffConfig, diff_maps, write_diff
     from mapfusion.formats.by_suffix import read_maps
-    from predmapnet.errors import UserError
+    from predmapnet.errors import value_errors_told
     from predmapnet.files import check_output
 
     if out is not None:
         check_output(out)
-    try:
+    with value_errors_told():
         (before, after), plane = read_maps([old, new])
-    except ValueError as error:
-        raise UserError(str(error)) from error
     config = DiffConfig(tolerance=tolerance, reach=max(2.0, 2.0 * tolerance), align=align)
     found = diff_maps(before, after, plane, config)
     err.print(_alignment_sentence(found, align), markup=False)

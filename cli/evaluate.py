@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.options import DataRoot, Dataset, Device, OfficialFrames, Scheme, SplitScheme, Weights
+from cli.options import (
+    Compile,
+    DataRoot,
+    Dataset,
+    Device,
+    OfficialFrames,
+    PrecisionOption,
+    Scheme,
+    SplitScheme,
+    Weights,
+)
+from predmapnet.machine import NetworkOptions, Precision, available_cores, use_threads
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -52,11 +63,12 @@ def evaluate(
     ] = True,
     weights: Weights = None,
     device: Device = "auto",
+    precision: PrecisionOption = Precision.FLOAT32,
+    compiled: Compile = False,
 ) -> None:
     """Measure maps of frames and of whole drives with the metrics of the field."""
     from cli.console import err, out, progress_display
     from predmapnet.files import check_output
-    from predmapnet.machine import available_cores, use_threads
 
     for path in (json_file, report):
         if path is not None:
@@ -76,16 +88,15 @@ def evaluate(
         raise UserError("--roi is for submissions (.json); what is mapped here and our own files know their region.")
     length, width = (float(side) for side in roi.value.split("x"))
     settings = EvaluationSettings(
-        dataset,
-        data_root,
-        split_scheme.value,
-        official_frames,
-        results,
-        weights,
-        device,
-        RegionOfInterest(length, width),
-        threads,
-        default_cache() / "ground-truth" if truth_cache else None,
+        dataset=dataset,
+        data_root=data_root,
+        split_scheme=split_scheme.value,
+        official_frames=official_frames,
+        results=results,
+        network=NetworkOptions(weights, device, precision, compiled),
+        roi=RegionOfInterest(length, width),
+        threads=threads,
+        cache=default_cache() / "ground-truth" if truth_cache else None,
     )
     source, sentence = settings.open()
     err.print(sentence, markup=False)

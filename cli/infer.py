@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
-from predmapnet.machine import Precision
+from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
 def infer(
@@ -27,7 +27,6 @@ def infer(
 ) -> None:
     """Turn one driving scene into a global vector map."""
     from cli.console import err, progress_display, say_report, warn_of_weights
-    from predmapnet.machine import use_threads
     from predmapnet.runs.outputs import Outputs
 
     outputs = Outputs(out, recording, save_frames)
@@ -35,11 +34,10 @@ def infer(
     use_threads(threads)
     from predmapnet.runs.infer import MappingPipeline
 
-    pipeline = MappingPipeline.from_settings(
-        dataset, data_root, weights, device, allow_missing_cameras, precision, compiled
-    )
+    network = NetworkOptions(weights, device, precision, compiled)
+    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras)
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)
     with progress_display() as display:
-        report = pipeline.run(scene, outputs, display.preparing, display.frames)
-    say_report(report)
+        mapped = pipeline.run(scene, outputs, preparing=display.preparing, progress=display.frames)
+    say_report(mapped.report)

@@ -45,7 +45,7 @@ def integrate(
     from mapfusion.formats.by_suffix import write_map
     from mapfusion.ground import observed_rings
     from predmapnet import __version__
-    from predmapnet.errors import UserError
+    from predmapnet.errors import value_errors_told
     from predmapnet.runs.integrate import integrate_file
     from predmapnet.runs.outputs import Outputs
 
@@ -65,10 +65,8 @@ def integrate(
     }
     if done.synthetic:
         provenance["synthetic"] = True
-    try:
+    with value_errors_told():
         write_map(done.map, out, georeference, provenance)
-    except ValueError as error:
-        raise UserError(str(error)) from error
     for note in done.notes:
         say_warning(note)
     for reason, count in done.rejections.items():

@@ -28,17 +28,14 @@ def merge(
     from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
     from predmapnet import __version__
-    from predmapnet.errors import UserError
+    from predmapnet.errors import value_errors_told
     from predmapnet.files import check_output
 
     check_output(out)
-    try:
+    with value_errors_told(), progress_display() as display:
         check_suffix(out)
         paths = _files(maps, out)
-        with progress_display() as display:
-            report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
-    except ValueError as error:
-        raise UserError(str(error)) from error
+        report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
     screen.print(_summary(report))
     for line in _lines(report):
         screen.print(line, markup=False)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
-from predmapnet.machine import Precision
+from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
 def view(
@@ -33,7 +33,6 @@ def view(
     """
     from cli.console import err, progress_display, say_report, warn_of_weights
     from cli.viewer import Viewer
-    from predmapnet.machine import use_threads
     from predmapnet.runs.outputs import Outputs
 
     if what.endswith(".rrd"):
@@ -49,11 +48,12 @@ def view(
         use_threads(threads)
         from predmapnet.runs.infer import MappingPipeline
 
-        pipeline = MappingPipeline.from_settings(
-            dataset, data_root, weights, device, allow_missing_cameras, precision, compiled
-        )
+        network = NetworkOptions(weights, device, precision, compiled)
+        pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras)
         err.print(pipeline.sentence, markup=False)
         warn_of_weights(pipeline)
         with progress_display() as display:
-            report = pipeline.run(what, Outputs(), display.preparing, display.frames, viewer.recording)
-        say_report(report)
+            mapped = pipeline.run(
+                what, Outputs(), preparing=display.preparing, progress=display.frames, viewer=viewer.recording
+            )
+        say_report(mapped.report)

@@ -1,13 +1,17 @@
-"""What a process takes of the machine: CPU threads, memory that it keeps, and when it ends."""
+"""The machine under a run: options of the network, CPU threads and memory of a process, worker processes."""
 
 from __future__ import annotations
 
 import ctypes
 import multiprocessing
 import os
+import signal
 import sys
 import threading
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 
 class Precision(StrEnum):
@@ -15,6 +19,23 @@ class Precision(StrEnum):
 
     FLOAT32 = "float32"
     BFLOAT16 = "bfloat16"
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """The network of a run and how this machine computes with it.
+
+    Attributes:
+        weights: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
+        device: ``auto`` (a GPU if there is one), or a device by torch's name.
+        precision: of the image backbone and the BEV encoder.
+        compiled: whether these two are compiled, which delays the first frames.
+    """
+
+    weights: Path | None = None
+    device: str = "auto"
+    precision: Precision = Precision.FLOAT32
+    compiled: bool = False
 
 
 def use_threads(count: int) -> int:
@@ -60,8 +81,25 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
+def begin_worker(threads: int) -> None:
+    """Prepare a worker process: CPU threads, an end with its parent, and Ctrl-C left to the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    use_threads(threads)
+
+
+def stop_workers(pool: ProcessPoolExecutor) -> None:
+    """End all processes of a pool at once, whatever they are doing."""
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    for worker in workers:
+        worker.kill()
+    for worker in workers:
+        worker.join()
+    pool.shutdown(wait=False, cancel_futures=True)
+
+
 def end_with_parent() -> None:
-    """Let this process end as soon as the one that started it is gone, however that ended."""
+    """End this process as soon as its parent is gone, however that ended."""
 
     def watch() -> None:
         parent = multiprocessing.parent_process()

@@ -16,7 +16,7 @@ from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
-from predmapnet.machine import Precision
+from predmapnet.machine import NetworkOptions, Precision
 from predmapnet.network.image_input import Window, normalise_images, stack_windows
 from predmapnet.network.kernels.compilation import compile_features
 from predmapnet.network.kernels.inference import for_inference
@@ -87,26 +87,17 @@ class Mapper:
         self._lookups: list[tuple[Rig, RigGeometry]] = []
 
     @classmethod
-    def from_checkpoint(
-        cls,
-        path: Path | None = None,
-        device: str = "auto",
-        precision: Precision = Precision.FLOAT32,
-        compiled: bool = False,
-    ) -> Mapper:
-        """Load a network.
-
-        Args:
-            path: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
-            device: ``auto`` (a GPU if there is one), or as torch calls it.
-            precision: of the image backbone and the BEV encoder.
-            compiled: whether these two are compiled, which the first frames wait for.
+    def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
+        """Load a network; without options the shipped weights.
 
         Raises:
             UserError: the weights, the device or a compiler are not there.
         """
-        checkpoint = load_checkpoint(path)
-        return cls(checkpoint.network, choose_device(device), checkpoint.sha256, checkpoint.facts, precision, compiled)
+        options = options or NetworkOptions()
+        checkpoint = load_checkpoint(options.weights)
+        device = choose_device(options.device)
+        facts, sha256 = checkpoint.facts, checkpoint.sha256
+        return cls(checkpoint.network, device, sha256, facts, options.precision, options.compiled)
 
     @property
     def roi(self) -> RegionOfInterest:

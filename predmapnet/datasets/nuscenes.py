@@ -15,7 +15,7 @@ from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
-from predmapnet.datasets.ground_truth.map_file import read_map
+from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_nuscenes_sweep
@@ -164,7 +164,7 @@ class NuScenesSource:
         """Where the map lies; rendered towns carry a borrowed location and belong into the ocean."""
         if not self.synthetic:
             return nuscenes_georeference(info.location)
-        marker = read_map(self.root / DEMO_MARKER)[0]
+        marker = read_map_file(self.root / DEMO_MARKER)[0]
         return demo_georeference(f"demo world, {info.name}", int(marker.get("town_seed", 0)))
 
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 
 from predmapnet.datasets.argoverse2 import Argoverse2Source
-from predmapnet.datasets.ground_truth.map_file import read_map
+from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import Rig
@@ -95,7 +95,7 @@ def read_log(folder: Path, stride: int = 5) -> tuple[VectorMap, Trajectory, Rig]
     archives = sorted((folder / "map").glob("log_map_archive_*.json"))
     if not archives:
         raise UserError(f"{folder / 'map'} holds no log_map_archive_*.json, so there is no map to dress.")
-    archive, _ = read_map(archives[0])
+    archive, _ = read_map_file(archives[0])
     poses = np.tile(np.eye(4), (len(scene), 1, 1))
     timestamps = np.empty(len(scene), dtype=np.int64)
     for index in range(len(scene)):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
-from predmapnet.evaluation.frames import EvaluationFrame, simplified
+from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.precision_recall import AveragePrecision, accumulate
 
 Thresholds = tuple[float, ...]
@@ -65,7 +65,7 @@ def frame_flags(frame: EvaluationFrame, thresholds: Thresholds = STANDARD_THRESH
         ``(n, thresholds) int8``: 1 true positive, 0 false positive.
     """
     predicted = resample_all(frame.predicted.polylines, POINTS_PER_LINE)
-    truths = resample_all(simplified(frame.truth.polylines), POINTS_PER_LINE)
+    truths = resample_all(simplify_all(frame.truth.polylines), POINTS_PER_LINE)
     # A truth beyond the largest threshold can never be matched, wherever exactly it lies.
     matrix = chamfer_matrix(predicted, frame.predicted.kinds, truths, frame.truth.kinds, limit=max(thresholds))
     matched = match_greedily(matrix, frame.predicted.scores, thresholds)

@@ -21,7 +21,7 @@ from predmapnet.evaluation.chamfer_distance import (
     match_greedily,
     resample_all,
 )
-from predmapnet.evaluation.frames import EvaluationFrame, simplified
+from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.precision_recall import AveragePrecision
 from predmapnet.evaluation.tracks import form_tracks, truth_track_ids
 
@@ -108,7 +108,7 @@ def _matched_tracks(frame: EvaluationFrame, truth_ids: Integer, thresholds: Thre
     if len(rows) and len(truth_ids):
         kinds = frame.predicted.kinds[rows]
         predicted = resample_all([frame.predicted.polylines[row] for row in rows], POINTS_PER_LINE)
-        coarse = resample_all(simplified(frame.truth.polylines), _TRUTH_POINTS)
+        coarse = resample_all(simplify_all(frame.truth.polylines), _TRUTH_POINTS)
         truths = resample_all(list(coarse), POINTS_PER_LINE)
         matrix = chamfer_matrix(predicted, kinds, truths, frame.truth.kinds, limit=max(thresholds))
         found = match_greedily(matrix, frame.predicted.scores[rows], thresholds)

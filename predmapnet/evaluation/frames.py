@@ -68,7 +68,7 @@ def _check_elements(where: str, kinds: Integer, polylines: Sequence[Float]) -> N
         raise UserError(f"{where} {unknown[0]}: there is no element kind {kinds[unknown[0]]} (0, 1 and 2 exist).")
 
 
-def simplified(polylines: Sequence[Float]) -> tuple[Float, ...]:
+def simplify_all(polylines: Sequence[Float]) -> tuple[Float, ...]:
     """Simplify lines by 0.2 m with topology kept, as the official evaluation does with its ground truth.
 
     Args:

@@ -16,7 +16,7 @@ _EPSILON = float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True)
-class Curve:
+class PrecisionRecallCurve:
     """Precision over recall of one kind at one threshold, in descending score.
 
     Attributes:
@@ -43,7 +43,7 @@ class KindResult:
     """
 
     kind: ElementKind
-    curves: tuple[Curve, ...]
+    curves: tuple[PrecisionRecallCurve, ...]
     truths: int
     predictions: int
 
@@ -84,7 +84,9 @@ class AveragePrecision:
         return figures
 
 
-def precision_recall(scores: Float, true_positive: NDArray[np.bool_], truths: int, threshold: float) -> Curve:
+def precision_recall(
+    scores: Float, true_positive: NDArray[np.bool_], truths: int, threshold: float
+) -> PrecisionRecallCurve:
     """Sort by score (stable) and accumulate.
 
     Args:
@@ -104,7 +106,7 @@ def precision_recall(scores: Float, true_positive: NDArray[np.bool_], truths: in
     precision = hits / np.maximum(counted, _EPSILON)
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     area = float(np.sum(np.diff(recall, prepend=0.0) * envelope))
-    return Curve(threshold, scores[order], precision, recall, area)
+    return PrecisionRecallCurve(threshold, scores[order], precision, recall, area)
 
 
 def accumulate(

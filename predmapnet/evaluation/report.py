@@ -15,7 +15,7 @@ from mapfusion.elements import ElementKind
 from predmapnet.evaluation.measurement import Measurement
 from predmapnet.evaluation.precision_recall import KindResult
 from predmapnet.evaluation.report_drawings import COLOURS, draw_bars, draw_curves, draw_frame
-from predmapnet.files import write_whole
+from predmapnet.files import write_file
 
 WORST_FRAMES = 8
 SHOWN_SCORE = 0.4
@@ -43,7 +43,7 @@ def write_figures(path: Path, figures: Mapping[str, Any], context: Mapping[str, 
         UserError: the file cannot be written.
     """
     content = {"evaluated": {"version": predmapnet.__version__, **context}, **figures}
-    with write_whole(path) as temporary:
+    with write_file(path) as temporary:
         temporary.write_bytes(orjson.dumps(content, option=orjson.OPT_INDENT_2) + b"\n")
 
 
@@ -95,7 +95,7 @@ def write_report(path: Path, measurement: Measurement, context: Mapping[str, Any
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>PredMapNet on {escape(what)}</title>'
         f"<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
-    with write_whole(path) as temporary:
+    with write_file(path) as temporary:
         temporary.write_text(html, encoding="utf-8")
 
 

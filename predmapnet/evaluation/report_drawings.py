@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.evaluation.precision_recall import Curve
+from predmapnet.evaluation.precision_recall import PrecisionRecallCurve
 
 Float = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _MARGIN = 34
 _MOST_POINTS = 400
 
 
-def draw_curves(curves: Sequence[Curve]) -> str:
+def draw_curves(curves: Sequence[PrecisionRecallCurve]) -> str:
     """Precision over recall, one line per threshold, the darkest for the largest."""
     parts = [_axes("recall", "precision")]
     for row, (curve, shade) in enumerate(zip(curves, _SHADES, strict=True)):

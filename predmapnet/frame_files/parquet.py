@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
-from predmapnet.files import write_whole
+from predmapnet.files import write_file
 
 Float = NDArray[np.float64]
 
@@ -114,7 +114,7 @@ class FrameWriter:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        temporary = self._stack.enter_context(write_whole(self._path))
+        temporary = self._stack.enter_context(write_file(self._path))
         self._writer = self._stack.enter_context(pq.ParquetWriter(temporary, self._schema, compression="zstd"))
         return self
 
@@ -158,7 +158,13 @@ class FrameWriter:
             self._rows.clear()
 
 
-def write_frames(path: Path, scene: str, frame_maps: Sequence[FrameMap], provenance: Mapping[str, Any]) -> None:
+def write_frames(
+    path: Path,
+    scene: str,
+    frame_maps: Sequence[FrameMap],
+    provenance: Mapping[str, Any],
+    tokens: Sequence[str] | None = None,
+) -> None:
     """Write all frames of one scene to a Parquet file, whole or not at all.
 
     Args:
@@ -166,13 +172,14 @@ def write_frames(path: Path, scene: str, frame_maps: Sequence[FrameMap], provena
         scene: name of the scene.
         frame_maps: frames 0, 1, ... of the scene.
         provenance: anything that JSON can hold.
+        tokens: the data set's own names of the frames, if it has any.
 
     Raises:
         UserError: the file cannot be written.
     """
     with FrameWriter(path, provenance) as writer:
         for index, frame_map in enumerate(frame_maps):
-            writer.write(scene, index, frame_map)
+            writer.write(scene, index, frame_map, tokens[index] if tokens else "")
 
 
 def stored_scenes(path: Path) -> tuple[str, ...]:

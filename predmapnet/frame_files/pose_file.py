@@ -13,7 +13,10 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from mapfusion.integrate.observations import pose_problem
+from predmapnet.datasets.poses import pose_matrix
 from predmapnet.errors import UserError
+from predmapnet.scenes import Instant
 
 Float = NDArray[np.float64]
 
@@ -25,20 +28,14 @@ HOW = (
 
 
 @dataclass(frozen=True)
-class FramePose:
-    """When and where a frame was taken.
+class FramePose(Instant):
+    """Time and pose of a frame, as a file gives them.
 
     Attributes:
-        token: its name.
         scene: name of the drive, empty if the file does not say.
-        timestamp: integer nanoseconds.
-        ego_to_global: ``(4, 4) float64``, rigid.
     """
 
-    token: str
     scene: str
-    timestamp: int
-    ego_to_global: Float
 
 
 def read_poses(path: Path) -> dict[str, FramePose]:
@@ -106,33 +103,21 @@ def _pose(where: str, row: Mapping[str, Any]) -> FramePose:
         raise UserError(f"{where}: {' and '.join(missing)} missing. {HOW}.")
     try:
         timestamp = int(row["timestamp"])
-        matrix = _matrix(row)
+        matrix = _matrix(where, row)
     except KeyError as error:
         raise UserError(f"{where}: {error} is missing. {HOW}.") from error
     except (TypeError, ValueError) as error:
         raise UserError(f"{where}: {error}. {HOW}.") from error
-    if not np.isfinite(matrix).all():
-        raise UserError(f"{where}: the pose is not finite.")
-    rotation = matrix[:3, :3]
-    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise UserError(f"{where}: the pose is not rigid; its rotation is {np.round(rotation, 3).tolist()}.")
-    return FramePose(str(row["token"]), str(row.get("scene", row.get("log", ""))), timestamp, matrix)
+    problem = pose_problem(matrix)
+    if problem is not None:
+        raise UserError(f"{where}: {problem}; its rotation is {np.round(matrix[:3, :3], 3).tolist()}.")
+    return FramePose(str(row["token"]), timestamp, matrix, str(row.get("scene", row.get("log", ""))))
 
 
-def _matrix(row: Mapping[str, Any]) -> Float:
+def _matrix(where: str, row: Mapping[str, Any]) -> Float:
     if "ego_to_global" in row:
         matrix = np.array(row["ego_to_global"], dtype=np.float64)
         if matrix.size != 16:
             raise ValueError(f"ego_to_global has {matrix.size} numbers instead of 16")
         return matrix.reshape(4, 4)
-    matrix = np.eye(4)
-    matrix[:3, 3] = np.array(row["translation"], dtype=np.float64)
-    w, x, y, z = np.array(row["rotation"], dtype=np.float64)
-    if not 0.99 < w * w + x * x + y * y + z * z < 1.01:
-        raise ValueError("the quaternion has not length 1")
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return matrix
+    return pose_matrix(row["rotation"], row["translation"], where)

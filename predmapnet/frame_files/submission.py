@@ -89,11 +89,18 @@ def read_submission(path: Path) -> dict[str, SubmittedFrame]:
     Raises:
         UserError: no such file, a pickle, no JSON, or a frame that is not as described; the message names it.
     """
-    if not path.is_file():
-        raise UserError(f"There is no file {path}.")
-    refuse_pickle(path)
-    content = _load(path)
-    results = content.get("results") if isinstance(content, dict) else content
+    results = load_results(path)
+    if is_maptr(results):
+        raise UserError(
+            f"{path} is a result file of MapTR (a list with 'sample_token'), whose classes have other numbers and "
+            "whose axes on nuScenes are the lidar's. Convert it first: labels by cls_name to 0 ped_crossing, "
+            "1 divider, 2 boundary, and on nuScenes (x, y) to (y, -x)."
+        )
+    return submitted_frames(path, results)
+
+
+def submitted_frames(path: Path, results: Any) -> dict[str, SubmittedFrame]:
+    """Check and convert what :func:`load_results` returned; arguments, result and errors of :func:`read_submission`."""
     frames: dict[str, SubmittedFrame] = {}
     for name, entry in _entries(path, results):
         if name in frames:
@@ -105,29 +112,32 @@ def read_submission(path: Path) -> dict[str, SubmittedFrame]:
     return frames
 
 
-def _load(path: Path) -> Any:
+def load_results(path: Path) -> Any:
+    """Load a JSON file of results: the content of its key ``results``, or all of it. Raises UserError."""
+    if not path.is_file():
+        raise UserError(f"There is no file {path}.")
+    refuse_pickle(path)
     data = path.read_bytes()
     try:
-        return orjson.loads(data)
+        content = orjson.loads(data)
     except orjson.JSONDecodeError:
-        pass
-    try:
-        # Python's own writer puts NaN into files; read it, so that the element can be named that holds it.
-        return json.loads(data)
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} is not valid JSON: {error}.") from error
+        try:
+            # Python's own writer puts NaN into files; it is read, so that the element that holds it can be named.
+            content = json.loads(data)
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path} is not valid JSON: {error}.") from error
+    return content.get("results") if isinstance(content, dict) else content
+
+
+def is_maptr(results: Any) -> bool:
+    """Whether loaded results have MapTR's layout: a list of entries with ``sample_token``."""
+    return isinstance(results, list) and any("sample_token" in entry for entry in results if isinstance(entry, dict))
 
 
 def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
     """Give the name and the entry of each frame, whichever layout it is."""
     if isinstance(results, dict):
         yield from results.items()
-    elif isinstance(results, list) and any("sample_token" in entry for entry in results if isinstance(entry, dict)):
-        raise UserError(
-            f"{path} is a result file of MapTR (a list with 'sample_token'), whose classes have other numbers and "
-            "whose axes on nuScenes are the lidar's. Convert it first: labels by cls_name to 0 ped_crossing, "
-            "1 divider, 2 boundary, and on nuScenes (x, y) to (y, -x)."
-        )
     elif isinstance(results, list):
         for number, entry in enumerate(results):
             if not isinstance(entry, dict) or "scene_name" not in entry or "local_idx" not in entry:

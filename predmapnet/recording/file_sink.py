@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import rerun as rr
 
-from predmapnet.files import partial_name, write_whole
+from predmapnet.files import write_file
 
 
 class RecordingFile:
@@ -24,19 +25,21 @@ class RecordingFile:
         self._recording = recording
         self._path = path
         self._error: OSError | None = None
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
+        temporary = self._stack.enter_context(write_file(self._path))
         source, target = os.pipe()
-        self._pump = threading.Thread(target=self._carry, args=(source,), daemon=True)
+        self._pump = threading.Thread(target=self._carry, args=(source, temporary), daemon=True)
         self._pump.start()
         self._recording.set_sinks(rr.FileSink(f"/dev/fd/{target}"))
         os.close(target)
         return self
 
-    def _carry(self, source: int) -> None:
+    def _carry(self, source: int, temporary: Path) -> None:
         with open(source, "rb", buffering=0) as pipe:
             try:
-                with partial_name(self._path).open("wb") as file:
+                with temporary.open("wb") as file:
                     while block := pipe.read(1 << 20):
                         file.write(block)
             except OSError as error:
@@ -49,9 +52,8 @@ class RecordingFile:
     ) -> None:
         self._recording.disconnect()
         self._pump.join()
-        if kind is not None:
-            partial_name(self._path).unlink(missing_ok=True)
-            return
-        with write_whole(self._path):
-            if self._error is not None:
+        with self._stack:
+            if kind is None and self._error is not None:
                 raise self._error
+            if error is not None:
+                raise error

@@ -29,7 +29,7 @@ def densify(points: Float, spacing: float) -> Float:
     return np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=1)
 
 
-def runs(mask: NDArray[np.bool_]) -> list[slice]:
+def true_runs(mask: NDArray[np.bool_]) -> list[slice]:
     """Return the stretches of at least two consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start >= 2]
@@ -53,7 +53,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
     ahead = rays[:, 2] > NEAR_METRES
     pixels = rays[:, :2] / np.where(ahead, rays[:, 2], 1.0)[:, None]
     border = shapely.box(0, 0, camera.width, camera.height)
-    lines = [shapely.LineString(pixels[run]) for run in runs(ahead)]
+    lines = [shapely.LineString(pixels[run]) for run in true_runs(ahead)]
     parts = shapely.get_parts(shapely.intersection(lines, border))
     return [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString" and not part.is_empty]
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 import difflib
 import hashlib
 import multiprocessing
-import signal
 import traceback
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -26,8 +25,8 @@ import orjson
 
 import predmapnet
 from predmapnet.errors import UserError
-from predmapnet.files import check_output, write_whole
-from predmapnet.machine import Precision, end_with_parent, use_threads
+from predmapnet.files import check_output, write_file
+from predmapnet.machine import NetworkOptions, begin_worker, stop_workers
 from predmapnet.runs.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ class BatchSettings:
 
     Attributes:
         dataset, data_root: name and folder of the source that was opened.
-        weights, device, precision, compiled: as for a single scene.
+        network: its weights and how it computes.
         allow_missing_cameras: go on where a camera has no image.
         recordings, frames: write these files too.
         threads: CPU threads of each process.
@@ -49,14 +48,11 @@ class BatchSettings:
 
     dataset: str
     data_root: Path
-    weights: Path | None = None
-    device: str = "auto"
+    network: NetworkOptions = field(default_factory=NetworkOptions)
     allow_missing_cameras: bool = False
     recordings: bool = False
     frames: bool = False
     threads: int = 1
-    precision: Precision = Precision.FLOAT32
-    compiled: bool = False
 
     def outputs(self, scene: str, folder: Path) -> Outputs:
         """Name the files of one scene."""
@@ -133,7 +129,7 @@ class BatchJournal:
         ordered = sorted(self.outcomes, key=lambda outcome: outcome.scene)
         counts = Counter(outcome.status for outcome in ordered)
         summary = {"counts": dict(counts), "scenes": [asdict(outcome) for outcome in ordered]}
-        with write_whole(self._folder / "summary.json") as temporary:
+        with write_file(self._folder / "summary.json") as temporary:
             temporary.write_bytes(orjson.dumps(summary, option=orjson.OPT_INDENT_2))
 
 
@@ -145,8 +141,8 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
         settings.dataset,
         str(settings.data_root),
         settings.allow_missing_cameras,
-        settings.precision,
-        settings.compiled,
+        settings.network.precision,
+        settings.network.compiled,
     ]
     return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 
@@ -208,7 +204,7 @@ def _in_pool(
     broken: list[str] = []
     while waiting:
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(settings,))
+        pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=begin_worker, initargs=(settings.threads,))
         running: dict[Future[Outcome], str] = {}
         try:
             while waiting or running:
@@ -228,26 +224,16 @@ def _in_pool(
                     break
         finally:
             if running:
-                _stop(pool, folder)
+                stop_workers(pool)
+                remove_unfinished(folder)
             else:
                 pool.shutdown()
     return broken
 
 
-def _stop(pool: ProcessPoolExecutor, folder: Path) -> None:
-    """End a pool at once (Ctrl-C); scenes that are being mapped leave nothing."""
-    workers = list((getattr(pool, "_processes", None) or {}).values())
-    for worker in workers:
-        worker.kill()
-    for worker in workers:
-        worker.join()
-    pool.shutdown(wait=False, cancel_futures=True)
-    remove_unfinished(folder)
-
-
 def remove_unfinished(folder: Path) -> None:
     """Remove files that were being written when a process was killed."""
-    for leftover in folder.glob(".*.part"):
+    for leftover in folder.glob(".*.part*"):
         leftover.unlink(missing_ok=True)
 
 
@@ -255,19 +241,12 @@ _pipeline: MappingPipeline | None = None
 """The source and the network of a worker process, opened once."""
 
 
-def _begin_worker(settings: BatchSettings) -> None:
-    # Ctrl-C is the parent's business; it ends its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    use_threads(settings.threads)
-
-
 def _map_one(scene: str, folder: Path, settings: BatchSettings, fingerprint: str) -> Outcome:
     start = perf_counter()
     try:
-        report = _worker_pipeline(settings).run(scene, settings.outputs(scene, folder))
+        report = _worker_pipeline(settings).run(scene, settings.outputs(scene, folder)).report
         content = asdict(report) | {"written": [path.name for path in report.written]}
-        with write_whole(summary_path(folder, scene)) as temporary:
+        with write_file(summary_path(folder, scene)) as temporary:
             summary = {"scene": scene, "settings": fingerprint, "report": content}
             temporary.write_bytes(orjson.dumps(summary, option=orjson.OPT_INDENT_2))
         return Outcome(scene, "done", perf_counter() - start, content)
@@ -284,13 +263,7 @@ def _worker_pipeline(settings: BatchSettings) -> MappingPipeline:
     if _pipeline is None:
         from predmapnet.runs.infer import MappingPipeline
 
-        _pipeline = MappingPipeline.from_settings(
-            settings.dataset,
-            settings.data_root,
-            settings.weights,
-            settings.device,
-            settings.allow_missing_cameras,
-            settings.precision,
-            settings.compiled,
+        _pipeline = MappingPipeline.open(
+            settings.dataset, settings.data_root, settings.network, settings.allow_missing_cameras
         )
     return _pipeline

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -20,8 +19,8 @@ from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
 from predmapnet.frame_files.parquet import read_frames, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
-from predmapnet.machine import use_threads
-from predmapnet.map_scene import NETWORK_ERRORS
+from predmapnet.machine import NetworkOptions, begin_worker, stop_workers
+from predmapnet.mapping import NETWORK_ERRORS
 from predmapnet.scenes import Instant, Progress, Scene, SceneSource
 from predmapnet.sources import open_source
 
@@ -32,15 +31,15 @@ Submitted = dict[str, SubmittedFrame]
 """Frames of a submission by name."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluationSettings:
-    """What is measured; the same for all scenes, and sent to the processes.
+    """Settings of an evaluation, the same for all scenes and processes.
 
     Attributes:
         dataset, data_root: where frames, poses and ground truth come from.
         split_scheme, official_frames: see :func:`predmapnet.sources.open_source`.
         results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
-        weights, device: of the network that maps.
+        network: that maps.
         roi: region of a submission, which does not say it itself.
         threads: CPU threads of each process.
         cache: folder that keeps the ground truth; None computes it anew.
@@ -51,8 +50,7 @@ class EvaluationSettings:
     split_scheme: str = "old"
     official_frames: bool = False
     results: Path | None = None
-    weights: Path | None = None
-    device: str = "auto"
+    network: NetworkOptions = field(default_factory=NetworkOptions)
     roi: RegionOfInterest = field(default_factory=RegionOfInterest)
     threads: int = 1
     cache: Path | None = None
@@ -108,24 +106,15 @@ def measure_scenes(
             yield _measure(settings, scene, submitted.get(scene), preparing)
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_begin_worker, initargs=(settings.threads,))
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=begin_worker, initargs=(settings.threads,))
     try:
         futures = [pool.submit(_measure, settings, scene, submitted.get(scene)) for scene in scenes]
         for future in futures:
             yield future.result()
     except BaseException:
-        workers = list((getattr(pool, "_processes", None) or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for worker in workers:
-            worker.terminate()
+        stop_workers(pool)
         raise
     pool.shutdown()
-
-
-def _begin_worker(threads: int) -> None:
-    # Ctrl-C is the parent's business; it ends its workers itself.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    use_threads(threads)
 
 
 def _measure(
@@ -133,7 +122,7 @@ def _measure(
 ) -> SceneMeasurement:
     scene = _source(settings).open(name, preparing)
     if settings.results is None:
-        from predmapnet.map_scene import map_scene
+        from predmapnet.mapping import map_scene
 
         run = map_scene(scene, _mapper(settings))
         frames = _with_truth(scene, run.frame_maps, settings.cache)
@@ -155,7 +144,7 @@ def _source(settings: EvaluationSettings) -> SceneSource:
 def _mapper(settings: EvaluationSettings) -> Mapper:
     from predmapnet.mapper import Mapper
 
-    return Mapper.from_checkpoint(settings.weights, device=settings.device)
+    return Mapper.from_checkpoint(settings.network)
 
 
 def _submission(path: Path) -> Submitted:
@@ -189,7 +178,7 @@ def _scene_by_name(submission: Submitted, source: SceneSource) -> dict[str, str]
 def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str]:
     """Names of the scenes that results hold; ``every_frame``: all frames of a submission must be known."""
     if results.is_dir():
-        names = {path.stem for path in results.glob("*.parquet")}
+        names = {path.stem for path in results.glob("[!.]*.parquet")}  # A dot begins what is being written.
         if not names:
             raise UserError(
                 f"The folder {results} holds no per-frame results (*.parquet); "

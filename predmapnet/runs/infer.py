@@ -1,4 +1,4 @@
-"""The run of one scene: source -> Mapper -> integrator -> files, and a report of what came of it."""
+"""Mapping one scene: source, Mapper, integrator, files and a report."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
-from predmapnet.frame_files.parquet import FrameWriter
-from predmapnet.machine import Precision
-from predmapnet.map_scene import MapSnapshot, Observer, SceneRun, Step, map_scene
+from predmapnet.frame_files.parquet import write_frames
+from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
+from predmapnet.mapping import MapSnapshot, Observer, SceneRun, Step, map_scene
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
 from predmapnet.runs.outputs import Outputs
 from predmapnet.scenes import Progress, Scene, SceneSource
@@ -97,13 +97,27 @@ class SceneReport:
     written: tuple[Path, ...] = field(default=())
 
 
+@dataclass(frozen=True)
+class MappedScene:
+    """Result of a pipeline: the map, its frames and the report.
+
+    Attributes:
+        run: the global map, and the map of each frame without rasters.
+        report: the figures.
+    """
+
+    run: SceneRun
+    report: SceneReport
+
+
 class MappingPipeline:
     """Maps scenes of one source with one network.
 
     Example:
-        >>> pipeline = MappingPipeline.from_settings()  # doctest: +SKIP
-        >>> pipeline.run("scene-0103", Outputs(map=Path("map.geojson"))).elements  # doctest: +SKIP
-        {'ped_crossing': 12, 'divider': 31, 'boundary': 24}
+        >>> pipeline = MappingPipeline.open()  # doctest: +SKIP
+        >>> mapped = pipeline.run("scene-0103", Outputs(map=Path("map.geojson")))  # doctest: +SKIP
+        >>> mapped.report.elements, len(mapped.run.global_map)  # doctest: +SKIP
+        ({'ped_crossing': 12, 'divider': 31, 'boundary': 24}, 67)
     """
 
     def __init__(
@@ -115,35 +129,31 @@ class MappingPipeline:
         self._allow_missing_cameras = allow_missing_cameras
 
     @classmethod
-    def from_settings(
+    def open(
         cls,
         dataset: str | None = None,
         data_root: Path | None = None,
-        weights: Path | None = None,
-        device: str = "auto",
+        network: NetworkOptions | None = None,
         allow_missing_cameras: bool = False,
-        precision: Precision = Precision.FLOAT32,
-        compiled: bool = False,
     ) -> MappingPipeline:
-        """Choose the source and load the network, as the options of the commands say.
+        """Choose the source and load the network.
 
         Raises:
             UserError: what was asked for is missing or broken.
         """
         source, sentence = open_source(dataset, data_root)
-        return cls(
-            source, Mapper.from_checkpoint(weights, device, precision, compiled), sentence, allow_missing_cameras
-        )
+        return cls(source, Mapper.from_checkpoint(network), sentence, allow_missing_cameras)
 
     def run(
         self,
         scene_name: str,
         outputs: Outputs,
+        *,
         preparing: Progress | None = None,
         progress: FrameProgress | None = None,
         viewer: rr.RecordingStream | None = None,
-    ) -> SceneReport:
-        """Map one scene and write what is wanted; each file appears whole or not at all.
+    ) -> MappedScene:
+        """Map one scene and write the outputs; each file appears whole or not at all.
 
         Args:
             scene_name: as the source calls it.
@@ -180,10 +190,10 @@ class MappingPipeline:
                 observed = observed_rings(run.observed, georeference)
                 write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
             if outputs.frames is not None:
-                with FrameWriter(outputs.frames, provenance) as writer:
-                    for frame, frame_map in zip(run.frames, run.frame_maps, strict=True):
-                        writer.write(frame.scene, frame.index, frame_map, frame.token)
-        return _report(scene, run, measure(scene, run, self.mapper.roi), preparing_seconds, outputs)
+                tokens = [frame.token for frame in run.frames]
+                write_frames(outputs.frames, scene_name, run.frame_maps, provenance, tokens)
+        accuracy = measure(scene, run, self.mapper.roi)
+        return MappedScene(run, _report(scene, run, accuracy, preparing_seconds, outputs))
 
     def provenance(self, scene: Scene) -> dict[str, Any]:
         """Where the map of a scene comes from, as written into it. Names no path of this machine."""

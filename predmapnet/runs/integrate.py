@@ -8,19 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import shapely
-from numpy.typing import NDArray
 
-from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
+from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
 from mapfusion.ground import seen_along
 from predmapnet.errors import UserError
-from predmapnet.frame_files.parquet import read_frames, refuse_pickle
+from predmapnet.frame_files.maptr import read_detections, turned
+from predmapnet.frame_files.parquet import read_frames
 from predmapnet.frame_files.pose_file import FramePose, read_poses
-from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
-from predmapnet.map_scene import NETWORK_ERRORS
-
-Float = NDArray[np.float64]
+from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name
+from predmapnet.mapping import NETWORK_ERRORS
 
 NAMED = 3
 """So many tokens are named where many do not match."""
@@ -89,16 +86,16 @@ def integrate_file(
     else:
         if poses is None:
             raise UserError(f"{frames} holds no poses: give them with --poses poses.json or --poses poses.csv.")
-        submitted = _read_json(frames)
+        submitted = read_detections(frames)
         known = read_poses(poses)
         if y_forward:
-            submitted = {token: _turned(frame) for token, frame in submitted.items()}
+            submitted = {token: turned(frame) for token, frame in submitted.items()}
         logged = _placed(frames, poses, submitted, known, roi or RegionOfInterest(), min_score, notes)
     location, synthetic = str(provenance.get("location", "")), bool(provenance.get("synthetic"))
-    return replace(integrate(logged), notes=tuple(notes), location=location, synthetic=synthetic)
+    return replace(integrate_frames(logged), notes=tuple(notes), location=location, synthetic=synthetic)
 
 
-def integrate(frames: Iterable[LoggedFrame]) -> Integration:
+def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
     """Fuse frames, in the order of their times.
 
     Raises:
@@ -116,54 +113,6 @@ def integrate(frames: Iterable[LoggedFrame]) -> Integration:
             fused.append(frame.frame_map)
     logs = tuple(dict.fromkeys(frame.log for frame in ordered))
     return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), seen_along(fused))
-
-
-def _read_json(path: Path) -> dict[str, SubmittedFrame]:
-    """Read a submission, or results of MapTR, which name their classes."""
-    if not path.is_file():
-        raise UserError(f"There is no file {path}.")
-    refuse_pickle(path)
-    try:
-        content = orjson.loads(path.read_bytes())
-    except orjson.JSONDecodeError:
-        return read_submission(path)  # says what is wrong
-    results = content.get("results") if isinstance(content, dict) else None
-    if isinstance(results, list) and results and isinstance(results[0], dict) and "sample_token" in results[0]:
-        return {str(entry.get("sample_token")): _maptr_frame(path, entry) for entry in results}
-    return read_submission(path)
-
-
-def _maptr_frame(path: Path, entry: Mapping[str, Any]) -> SubmittedFrame:
-    where = f"{path}, frame {entry.get('sample_token')}"
-    try:
-        vectors = entry["vectors"]
-        kinds = np.array([ElementKind[str(v["cls_name"]).upper()] for v in vectors], dtype=np.int64)
-        scores = np.array([v["confidence_level"] for v in vectors], dtype=np.float64)
-        points = tuple(np.array(v["pts"], dtype=np.float64)[:, :2] for v in vectors)
-    except KeyError as error:
-        raise UserError(
-            f"{where}: {error} is missing or unknown; pts, cls_name (ped_crossing, divider or boundary) and "
-            "confidence_level are expected in each vector."
-        ) from error
-    except (TypeError, ValueError, IndexError) as error:
-        raise UserError(f"{where}: the points or scores are not numbers as expected: {error}.") from error
-    rings = (
-        np.vstack([line, line[:1]])
-        if kind == ElementKind.PED_CROSSING and not np.array_equal(line[0], line[-1])
-        else line
-        for kind, line in zip(kinds, points, strict=True)
-    )
-    return SubmittedFrame(kinds, scores, np.full(len(kinds), -1), tuple(rings))
-
-
-def _turned(frame: SubmittedFrame) -> SubmittedFrame:
-    """From x right, y forward to x forward, y left."""
-    visible = None if frame.visible is None else tuple(map(_turned_line, frame.visible))
-    return replace(frame, polylines=tuple(map(_turned_line, frame.polylines)), visible=visible)
-
-
-def _turned_line(line: Float) -> Float:
-    return np.column_stack([line[:, 1], -line[:, 0]])
 
 
 def _placed(
@@ -206,17 +155,7 @@ def _placed(
             ids = np.where(frame.scores >= min_score, next_track + np.arange(count), -1)
             frame = replace(frame, track_ids=ids)
             next_track += count
-        frame_map = FrameMap(
-            pose.timestamp,
-            pose.ego_to_global,
-            roi,
-            frame.kinds,
-            frame.scores,
-            frame.track_ids,
-            frame.polylines,
-            visible=frame.visible,
-        )
-        logged.append(LoggedFrame(pose.scene, frame_map))
+        logged.append(LoggedFrame(pose.scene, frame.at(pose, roi)))
     return logged
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapfusion.formats.by_suffix import check_suffix
-from predmapnet.errors import UserError
+from predmapnet.errors import UserError, value_errors_told
 from predmapnet.files import check_output
 
 
@@ -36,7 +36,5 @@ class Outputs:
         if len({path.absolute() for path in self.paths}) < len(self.paths):
             raise UserError("two outputs have the same name; give each its own")
         if self.map is not None:
-            try:
+            with value_errors_told():
                 check_suffix(self.map)
-            except ValueError as error:
-                raise UserError(str(error)) from error

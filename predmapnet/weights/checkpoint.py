@@ -18,7 +18,7 @@ from safetensors.torch import save
 
 from predmapnet import __version__
 from predmapnet.errors import UserError
-from predmapnet.files import write_whole
+from predmapnet.files import write_file
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import parse_config
 from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
@@ -66,7 +66,7 @@ def save_checkpoint(
         "facts": dict(facts or {}),
     }
     metadata = {KEY: json.dumps(about)}
-    with write_whole(path) as temporary:
+    with write_file(path) as temporary:
         temporary.write_bytes(save(tensors, metadata))
 
 

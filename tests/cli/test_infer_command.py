@@ -36,7 +36,7 @@ def leftovers(folder: Path) -> list[str]:
 
 
 def mapping_began(folder: Path) -> bool:
-    return any(path.stat().st_size > 100_000 for path in folder.glob(".r.rrd.*.part"))
+    return any(path.stat().st_size > 100_000 for path in folder.glob(".*.part.rrd"))
 
 
 def without_time(path: Path) -> str:

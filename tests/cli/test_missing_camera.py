@@ -10,8 +10,9 @@ from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.ground import ground_within
 from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.map_scene import NETWORK_ERRORS, map_scene
+from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
+from predmapnet.mapping import NETWORK_ERRORS, map_scene
 from tests.cli.tiny_nuscenes import image_path, write_tiny_nuscenes
 
 
@@ -54,7 +55,7 @@ def test_a_script_that_loops_over_frames_gets_the_map_of_the_command(predmapnet,
     assert predmapnet("infer", "scene-0001", "--out", "map.geojson", *arguments).code == 0
 
     scene = NuScenesSource(root).open("scene-0001")
-    mapper = Mapper.from_checkpoint(random_weights)
+    mapper = Mapper.from_checkpoint(NetworkOptions(random_weights))
     integrator, state = MapIntegrator(NETWORK_ERRORS), None
     for index in range(len(scene)):
         frame_map, state = mapper.step(scene.frame(index), state, allow_missing_cameras=True)

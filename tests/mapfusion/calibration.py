@@ -102,7 +102,7 @@ def drives_of(place: str, detector: Detector, frames: int, seeds: range) -> list
 
 def print_towns(folder: Path) -> None:
     """Print the share for the shipped network, over all scenes of a split."""
-    from predmapnet.map_scene import NETWORK_ERRORS
+    from predmapnet.mapping import NETWORK_ERRORS
     from tests.mapfusion.demo_towns import mapped_towns
 
     for split in ("val", "test"):

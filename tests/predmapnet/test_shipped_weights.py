@@ -6,10 +6,10 @@ import pytest
 
 from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.config import PredMapNetConfig
-from predmapnet.datasets.ground_truth import truth_from_vector_map
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.demo_world.catalogue import trajectory, vector_map
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
+from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.fill_cache import cache_demo_scene

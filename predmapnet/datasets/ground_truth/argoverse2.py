@@ -19,7 +19,7 @@ from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA
 from predmapnet.datasets.ground_truth.lane_dividers import (
     LaneSide,
     Sides,
-    chained,
+    chain_dividers,
     connected,
     off_boundaries,
     relinked,
@@ -28,7 +28,7 @@ from predmapnet.datasets.ground_truth.lane_dividers import (
     without_shared,
     without_twins,
 )
-from predmapnet.datasets.ground_truth.map_file import read_map
+from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     area_rings,
@@ -68,7 +68,7 @@ class Argoverse2GroundTruth:
         Raises:
             UserError: the file is missing, damaged, or not a vector map.
         """
-        content, self.fingerprint = read_map(map_file)
+        content, self.fingerprint = read_map_file(map_file)
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
             lanes = list(content["lane_segments"].values())
@@ -171,7 +171,7 @@ class Argoverse2GroundTruth:
         key = tuple(self._lane_rows[near].tolist())
         if key not in self._chains:
             left, right = self._unique_sides(key)
-            self._chains[key] = chained(relinked(left)) + chained(relinked(right))
+            self._chains[key] = chain_dividers(relinked(left)) + chain_dividers(relinked(right))
         return self._chains[key]
 
     def _unique_sides(self, rows: Sequence[int]) -> tuple[Sides, Sides]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shapely import LineString
 
 Float = NDArray[np.float64]
-Node = tuple[float, float, float]
+Vertex3D = tuple[float, float, float]
 
 SAME = 0.9
 """Two lines are the same if their buffers overlap with at least this IoU."""
@@ -102,7 +102,7 @@ def relinked(sides: Sides) -> Sides:
     return result
 
 
-def chained(sides: Sides) -> list[LineString]:
+def chain_dividers(sides: Sides) -> list[LineString]:
     """Step 6: walk the graph of boundary vertices; every simple path from a start to an end is one line.
 
     Where lanes branch, paths overlap; a closed loop without a start gives nothing.
@@ -110,10 +110,10 @@ def chained(sides: Sides) -> list[LineString]:
     Returns:
         Simplified lines with z, city frame.
     """
-    following: dict[Node, dict[Node, None]] = {}
-    incoming: dict[Node, int] = {}
+    following: dict[Vertex3D, dict[Vertex3D, None]] = {}
+    incoming: dict[Vertex3D, int] = {}
 
-    def connect(start: Node, end: Node) -> None:
+    def connect(start: Vertex3D, end: Vertex3D) -> None:
         for node in (start, end):
             following.setdefault(node, {})
             incoming.setdefault(node, 0)
@@ -132,7 +132,7 @@ def chained(sides: Sides) -> list[LineString]:
             if after in nodes and nodes[lane][-1] != nodes[after][0]:
                 connect(nodes[lane][-1], nodes[after][0])
     rank = {node: number for number, node in enumerate(following)}
-    paths: list[list[Node]] = []
+    paths: list[list[Vertex3D]] = []
     for root in (node for node, count in incoming.items() if count == 0):
         found = _simple_paths(root, following)
         paths += sorted(found, key=lambda path: rank[path[-1]])
@@ -142,13 +142,13 @@ def chained(sides: Sides) -> list[LineString]:
     return list(shapely.simplify(lines, PATH_SIMPLIFICATION))
 
 
-def _node(point: Float) -> Node:
+def _node(point: Float) -> Vertex3D:
     return (float(point[0]), float(point[1]), float(point[2]))
 
 
-def _simple_paths(root: Node, following: Mapping[Node, Mapping[Node, None]]) -> list[list[Node]]:
+def _simple_paths(root: Vertex3D, following: Mapping[Vertex3D, Mapping[Vertex3D, None]]) -> list[list[Vertex3D]]:
     """All paths without a repeated node from ``root`` to a node where nothing follows, depth first."""
-    paths: list[list[Node]] = []
+    paths: list[list[Vertex3D]] = []
     path = [root]
     on_path = {root}
     branches = [iter(following[root])]

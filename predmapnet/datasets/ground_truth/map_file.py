@@ -12,7 +12,7 @@ import orjson
 from predmapnet.errors import UserError
 
 
-def read_map(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
+def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
     """Read a map.
 
     Args:

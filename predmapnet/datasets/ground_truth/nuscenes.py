@@ -16,7 +16,7 @@ from shapely import LineString, Polygon, STRtree
 
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA, merge_crossings
-from predmapnet.datasets.ground_truth.map_file import read_map
+from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     apply,
@@ -31,7 +31,6 @@ from predmapnet.datasets.ground_truth.patch import (
     rotation_about,
 )
 from predmapnet.datasets.poses import quaternion_of, rotation_matrix
-from predmapnet.demo_world.world import VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
 
@@ -63,7 +62,7 @@ class NuScenesGroundTruth:
         Raises:
             UserError: the file is missing, damaged, or not a map expansion.
         """
-        content, digest = read_map(map_file)
+        content, digest = read_map_file(map_file)
         self.keep_corners = keep_corners
         self.fingerprint = digest + bytes([keep_corners])
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
@@ -88,21 +87,20 @@ class NuScenesGroundTruth:
             ) from None
 
     @classmethod
-    def from_vector_map(cls, vector_map: VectorMap) -> NuScenesGroundTruth:
-        """Take a map of the demo world as it is, without files; road dividers come before lane dividers.
+    def from_layers(
+        cls, dividers: list[LineString], crossings: list[Polygon], road_segments: list[Polygon], lanes: list[Polygon]
+    ) -> NuScenesGroundTruth:
+        """Take the layers of a map that is no file; no official figures depend on it, so crossings keep their corners.
 
-        No official figures depend on it, so crossings keep their corners.
+        Args:
+            dividers: road dividers, then lane dividers, global frame, metres, as everything here.
+            crossings: pieces of pedestrian crossings.
+            road_segments, lanes: drivable surface.
         """
         truth = cls.__new__(cls)
         truth.keep_corners = True
-        by_direction = sorted(vector_map.dividers, key=lambda divider: not divider.opposite)
-        truth._index(
-            dividers=[LineString(divider.points) for divider in by_direction],
-            crossings=[crossing.polygon for crossing in vector_map.crossings],
-            road_segments=list(vector_map.road_segments),
-            lanes=list(vector_map.lanes),
-        )
-        layers = (truth.dividers, truth.crossings, truth.road_segments, truth.lanes)
+        truth._index(dividers, crossings, road_segments, lanes)
+        layers = (dividers, crossings, road_segments, lanes)
         truth.fingerprint = hashlib.sha256(
             b"".join(shapely.to_wkb(shapely.geometrycollections(layer)) for layer in layers)
         ).digest()
@@ -260,11 +258,6 @@ class _Layer:
         parts, index = parts_of_type(shapely.intersection(self.valid[near], patch), part_type)
         records = [int(self._rows[near[row]]) for row in index]
         return list(shapely.transform(np.asarray(parts, dtype=object), place.to_local)), records
-
-
-def truth_from_vector_map(vector_map: VectorMap) -> NuScenesGroundTruth:
-    """Ground truth of a map of the demo world, without files."""
-    return NuScenesGroundTruth.from_vector_map(vector_map)
 
 
 def _polygons(

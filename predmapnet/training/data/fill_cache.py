@@ -88,11 +88,11 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
         folder: where to; its name is the scene's.
         config: of the network.
     """
-    from predmapnet.datasets.ground_truth import truth_from_vector_map
     from predmapnet.demo_world.catalogue import build_world
     from predmapnet.demo_world.render.lidar import scan
     from predmapnet.demo_world.render.renderer import Renderer
     from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
+    from predmapnet.demo_world.truth import truth_from_vector_map
 
     world = build_world(folder.name)
     cameras = [window_camera(camera, config, OVERSAMPLING) for camera in DEMO_RIG]

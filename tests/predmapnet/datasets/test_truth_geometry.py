@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 from shapely import LineString, Polygon
 
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.ground_truth import truth_from_vector_map
 from predmapnet.datasets.ground_truth.crossings import merge_crossings
-from predmapnet.datasets.ground_truth.lane_dividers import LaneSide, chained, connected, relinked
+from predmapnet.datasets.ground_truth.lane_dividers import LaneSide, chain_dividers, connected, relinked
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.vectors import normalised, permuted
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines, truth_map
 from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of, rotation_matrix
+from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 from predmapnet.errors import UserError
 
@@ -186,13 +186,13 @@ def test_branching_lanes_give_overlapping_paths_and_loops_none():
 
     stem = side(1, [(0, 0), (10, 0)], after=(2, 3))
     branches = side(2, [(10, 0), (20, 5)], before=(1,)), side(3, [(10, 0), (20, -5)], before=(1,))
-    paths = chained({side.lane: side for side in (stem, *branches)})
+    paths = chain_dividers({side.lane: side for side in (stem, *branches)})
     assert [path.coords[-1][:2] for path in paths] == [(20.0, 5.0), (20.0, -5.0)]
     loop = {
         1: side(1, [(0, 0), (9, 0)], before=(2,), after=(2,)),
         2: side(2, [(9, 0), (9, 9), (0, 0)], before=(1,), after=(1,)),
     }
-    assert chained(relinked(loop)) == []
+    assert chain_dividers(relinked(loop)) == []
 
 
 def test_connecting_prefers_the_start_and_repeats_the_joint():

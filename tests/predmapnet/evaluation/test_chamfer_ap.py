@@ -5,13 +5,13 @@ import pytest
 
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, chamfer_from_flags, frame_flags
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
-from predmapnet.evaluation.frames import simplified
+from predmapnet.evaluation.frames import simplify_all
 
 
 def test_simplified_truth_is_the_official_one(case):
     expected = np.split(case.intermediates["gt_eval_points"], case.intermediates["gt_eval_offsets"][1:-1])
     for frame, rows in zip(case.frames, case.truth_rows, strict=True):
-        for line, row in zip(simplified(frame.truth.polylines), rows, strict=True):
+        for line, row in zip(simplify_all(frame.truth.polylines), rows, strict=True):
             np.testing.assert_allclose(line, expected[row], atol=1e-9)
 
 

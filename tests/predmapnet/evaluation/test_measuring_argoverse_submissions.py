@@ -47,7 +47,7 @@ def test_the_truth_as_a_submission_is_perfect(source, tmp_path, size, name_of):
     scene = source.open(source.scenes()[0].name)
     entries = submitted_truth(scene, roi, name_of)
     (tmp_path / "submission.json").write_text(json.dumps({"meta": {}, "results": entries}))
-    settings = EvaluationSettings("argoverse2", LOGS, results=tmp_path / "submission.json", roi=roi)
+    settings = EvaluationSettings(dataset="argoverse2", data_root=LOGS, results=tmp_path / "submission.json", roi=roi)
     scenes = scenes_to_measure(settings, source, None)
     assert scenes == [scene.info.name]
     figures = pool_scenes(list(measure_scenes(settings, scenes))).figures()
@@ -60,6 +60,6 @@ def test_frames_at_another_phase_are_refused_with_a_hint(source, tmp_path):
     between = Argoverse2Source(LOGS, stride=1).open(source.scenes()[0].name).instant(1)
     entry = {"vectors": [], "scores": [], "labels": []}
     (tmp_path / "submission.json").write_text(json.dumps({"results": {str(between.timestamp): entry}}))
-    settings = EvaluationSettings("argoverse2", LOGS, results=tmp_path / "submission.json")
+    settings = EvaluationSettings(dataset="argoverse2", data_root=LOGS, results=tmp_path / "submission.json")
     with pytest.raises(UserError, match=r"1 of 1 frames are not in argoverse2 .* --official-frames\?"):
         scenes_to_measure(settings, source, None)

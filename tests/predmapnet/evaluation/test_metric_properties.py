@@ -12,7 +12,7 @@ from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
 from predmapnet.evaluation.consistency_ap import consistency_average_precision, with_formed_tracks
-from predmapnet.evaluation.frames import EvaluationFrame, simplified
+from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.raster_ap import raster_average_precision
 from predmapnet.scenes import FrameTruth
 
@@ -177,6 +177,6 @@ def test_the_wide_region_has_the_wide_thresholds():
 def test_simplification_keeps_lines_of_one_point_and_drops_small_bends():
     bent = np.array([[0.0, 0.0], [5.0, 0.1], [10.0, 0.0]])
     point = np.array([[1.0, 2.0]])
-    first, second = simplified([point, bent])
+    first, second = simplify_all([point, bent])
     np.testing.assert_array_equal(first, point)
     np.testing.assert_array_equal(second, bent[[0, 2]])

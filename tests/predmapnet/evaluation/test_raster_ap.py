@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapfusion.elements import ElementKind
-from predmapnet.evaluation.frames import simplified
+from predmapnet.evaluation.frames import simplify_all
 from predmapnet.evaluation.raster_ap import raster_from_matches, raster_matches
 from tests.predmapnet.evaluation.segmentation_iou import segmentation_iou
 
@@ -21,7 +21,8 @@ def variant(request, case):
     frames = case.frames
     if request.param.endswith("gt_eval"):
         frames = [
-            replace(frame, truth=replace(frame.truth, polylines=simplified(frame.truth.polylines))) for frame in frames
+            replace(frame, truth=replace(frame.truth, polylines=simplify_all(frame.truth.polylines)))
+            for frame in frames
         ]
     axes = request.param.split("_")[0]
     return request.param, [raster_matches(frame, axes) for frame in frames]

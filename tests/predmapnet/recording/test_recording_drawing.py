@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
 from predmapnet.recording.palette import KIND_COLOURS, raster_picture
-from predmapnet.recording.projection import bev_pixels, dashes, densify, project_line, runs
+from predmapnet.recording.projection import bev_pixels, dashes, densify, project_line, true_runs
 from predmapnet.scenes import Camera
 
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -51,7 +51,7 @@ def test_a_line_that_leaves_and_comes_back_makes_two_parts(front_camera):
 def test_runs_cover_the_true_values_that_have_a_true_neighbour(values):
     mask = np.array(values, dtype=bool)
     covered = np.zeros_like(mask)
-    for run in runs(mask):
+    for run in true_runs(mask):
         assert mask[run].all()
         covered[run] = True
     padded = np.pad(mask, 1)
