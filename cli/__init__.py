@@ -1,1 +1,1 @@
-"""The command line of PredMapNet: one file per command, no logic that a script would miss."""
+"""Command line of PredMapNet: one file per command, no logic that a script would miss."""

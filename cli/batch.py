@@ -22,14 +22,18 @@ from predmapnet.machine import NetworkOptions, Precision, available_cores
 
 
 def batch(
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to; made if it does not exist.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to write to; created if need be.")],
     scenes: Annotated[
-        list[str] | None, typer.Argument(help="Names of scenes, or the folder of a data set; all scenes if none.")
+        list[str] | None, typer.Argument(help="Names of scenes, or the folder of a data set; by default all scenes.")
     ] = None,
-    split: Annotated[str | None, typer.Option(help="All scenes of a split: train, val or test.")] = None,
+    split: Annotated[str | None, typer.Option(help="Only this split: train, val or test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
-    recordings: Annotated[bool, typer.Option("--recordings", help="Write a Rerun recording of each scene.")] = False,
-    save_frames: Annotated[bool, typer.Option("--save-frames", help="Write what each frame showed (Parquet).")] = False,
+    recordings: Annotated[
+        bool, typer.Option("--recordings", help="Write a Rerun recording of each scene (.rrd).")
+    ] = False,
+    save_frames: Annotated[
+        bool, typer.Option("--save-frames", help="Write the per-frame results of each scene (.parquet).")
+    ] = False,
     dataset: Dataset = None,
     data_root: DataRoot = None,
     split_scheme: SplitScheme = Scheme.OLD,
@@ -39,7 +43,7 @@ def batch(
     compiled: Compile = False,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
-    """Map many scenes with several processes; run it again to resume where it stopped.
+    """Map many scenes in several processes; run it again to resume after an interruption.
 
     Writes NAME.geojson and NAME.summary.json of each scene, log.jsonl and summary.json. The exit code is 1 if any
     scene failed.

@@ -1,4 +1,4 @@
-"""What the commands say: messages, progress (bars in a terminal, plain lines elsewhere) and tables."""
+"""Messages, progress (bars in a terminal, plain lines elsewhere) and tables of the commands."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ SECONDS_BETWEEN_LINES = 5.0
 
 
 def say_error(message: str) -> None:
-    """Print one message for something that the user can put right."""
+    """Print an error that the user can put right."""
     err.print(f"[bold red]Error:[/] {escape(message)}")
 
 
 def say_warning(message: str) -> None:
-    """Print one message for something that the user should know."""
+    """Print a note for the user."""
     err.print(f"[bold yellow]Note:[/] {escape(message)}")
 
 
 class ProgressDisplay:
-    """Shows how far a run is; both methods fit the callbacks of the pipeline."""
+    """Progress of a run; the methods fit the callbacks of the pipeline."""
 
     def __init__(self, bars: Progress | None) -> None:
         self._bars = bars
@@ -44,15 +44,15 @@ class ProgressDisplay:
         self._spoke: dict[str, float] = {}
 
     def preparing(self, done: int, total: int, what: str) -> None:
-        """Something is made ready."""
+        """Show the progress of a preparation."""
         self._show(what, done, total, "")
 
     def frames(self, done: int, total: int) -> None:
-        """Frames are mapped."""
+        """Show the number of frames mapped."""
         self._show("mapping", done, total, "frames/s")
 
     def scenes(self, done: int, total: int) -> None:
-        """Scenes of a batch are finished."""
+        """Show the number of scenes finished."""
         self._show("scenes", done, total, "")
 
     def _show(self, what: str, done: int, total: int, unit: str) -> None:
@@ -88,7 +88,7 @@ def progress_display() -> Iterator[ProgressDisplay]:
 
 
 def report_table(report: SceneReport) -> Table:
-    """Sum up one scene."""
+    """Return the table of one scene: elements and metres per kind."""
     table = Table(title=report.scene, title_justify="left", title_style="bold", show_edge=False, pad_edge=False)
     table.add_column("")
     table.add_column("elements", justify="right")
@@ -99,7 +99,7 @@ def report_table(report: SceneReport) -> Table:
 
 
 def report_lines(report: SceneReport) -> list[str]:
-    """Say what stands below the table: time, accuracy, files."""
+    """Return the lines below the table: time, accuracy, files."""
     prepared = f", {report.preparing_seconds:.1f} s to prepare" if report.preparing_seconds >= 1.0 else ""
     lines = [f"{report.frames} frames in {report.seconds:.1f} s ({report.frames_per_second:.1f} frames/s){prepared}"]
     if report.accuracy is not None:
@@ -113,22 +113,22 @@ def report_lines(report: SceneReport) -> list[str]:
 
 
 def warn_of_weights(pipeline: MappingPipeline) -> None:
-    """Warn of weights that cannot show how well the network maps."""
+    """Print a note about weights that say little about the method."""
     if pipeline.warning:
         say_warning(pipeline.warning)
 
 
 def say_report(report: SceneReport) -> None:
-    """Print the table, and what the integrator left out."""
+    """Print the report of one scene, and what the integrator rejected."""
     out.print(report_table(report))
     for line in report_lines(report):
         out.print(line, markup=False)
     for reason, count in report.rejections.items():
-        say_warning(f"the integrator left out {count} x {reason}")
+        say_warning(f"the integrator rejected {count} x {reason}")
 
 
 def say_outcomes(outcomes: Sequence[Outcome], folder: Path) -> None:
-    """Print one line per scene of a batch, and what failed with its reason."""
+    """Print one line per scene of a batch, and the reason of each failure."""
     table = Table(show_edge=False, pad_edge=False, collapse_padding=True)
     for heading in ("scene", ""):
         table.add_column(heading, no_wrap=True)

@@ -1,4 +1,4 @@
-"""``predmapnet diff``: what changed between two maps."""
+"""``predmapnet diff``: compare two maps of the same place."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ if TYPE_CHECKING:
 
 
 def diff(
-    old: Annotated[Path, typer.Argument(help="The map as it was.")],
-    new: Annotated[Path, typer.Argument(help="The map of a later drive.")],
+    old: Annotated[Path, typer.Argument(help="Map of the earlier drive.")],
+    new: Annotated[Path, typer.Argument(help="Map of the later drive.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Differences to write (GeoJSON).")] = None,
     tolerance: Annotated[
         float,
-        typer.Option(min=0.05, help="What moved less, or within both maps' uncertainty, is unchanged, metres."),
+        typer.Option(
+            min=0.05, help="Movements up to this, or within both maps' uncertainty, count as unchanged, metres."
+        ),
     ] = 0.5,
-    align: Annotated[bool, typer.Option(help="Take out an offset between the two drives where it is certain.")] = True,
+    align: Annotated[
+        bool, typer.Option(help="Align the later map to the earlier one if the alignment is certain.")
+    ] = True,
 ) -> None:
-    """Say what was added, removed or moved from one map to another, and what the new drive did not see."""
+    """Compare two maps: what was added, removed or moved, and what the later drive did not see."""
     from cli.console import err
     from cli.console import out as screen
     from mapfusion.diff import DiffConfig, diff_maps, write_diff

@@ -1,4 +1,4 @@
-"""``predmapnet evaluate``: measure against the ground truth."""
+"""``predmapnet evaluate``: measure maps against the ground truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KINDS = ("ped_crossing", "divider", "boundary")
 
 
 class Region(StrEnum):
-    """Sizes of the region of interest that the benchmarks know."""
+    """Regions of interest of the benchmarks."""
 
     STANDARD = "60x30"
     WIDE = "100x50"
@@ -39,34 +39,32 @@ def evaluate(
         Path | None,
         typer.Argument(
             help="Folder of `predmapnet batch --save-frames`, per-frame results (.parquet) or a submission (.json). "
-            "Without it the scenes are mapped first.",
+            "Without it, the scenes are mapped first.",
             show_default=False,
         ),
     ] = None,
-    split: Annotated[
-        str | None, typer.Option(help="Measure all scenes of a split: train, val or test.", show_default=False)
-    ] = None,
+    split: Annotated[str | None, typer.Option(help="Only this split: train, val or test.", show_default=False)] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write all figures to this file (JSON).", show_default=False)
+        Path | None, typer.Option("--json", help="Figures to write (JSON).", show_default=False)
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(help="Write curves and the worst frames to this file (HTML).", show_default=False)
+        Path | None, typer.Option(help="Report to write (HTML): curves and the worst frames.", show_default=False)
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
-    roi: Annotated[Region, typer.Option(help="Region of a submission, metres.")] = Region.STANDARD,
+    roi: Annotated[Region, typer.Option(help="Region of interest of a submission, metres.")] = Region.STANDARD,
     dataset: Dataset = None,
     data_root: DataRoot = None,
     split_scheme: SplitScheme = Scheme.OLD,
     official_frames: OfficialFrames = False,
     truth_cache: Annotated[
-        bool, typer.Option("--truth-cache/--no-truth-cache", help="Keep the ground truth on disk for the next time.")
+        bool, typer.Option("--truth-cache/--no-truth-cache", help="Cache the ground truth on disk.")
     ] = True,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
 ) -> None:
-    """Measure maps of frames and of whole drives with the metrics of the field."""
+    """Measure per-frame maps and maps of whole drives with the metrics of the field."""
     from cli.console import err, out, progress_display
     from predmapnet.files import check_output
 
@@ -182,7 +180,7 @@ def _add(table: Table, text: str, overall: float | None, values: list[float | No
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:
-    """Say what does not fit into the table: tracks, forecasts, speed."""
+    """Return the lines below the table: tracks, forecasts, speed."""
     lines = []
     tracks = figures["tracks"]
     if tracks["tracks"]:

@@ -15,7 +15,7 @@ def infer(
     scene: Annotated[str, typer.Argument(help="Name of the scene; `predmapnet scenes` lists them.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
-    save_frames: Annotated[Path | None, typer.Option(help="What each frame showed, to write (Parquet).")] = None,
+    save_frames: Annotated[Path | None, typer.Option(help="Per-frame results to write (.parquet).")] = None,
     dataset: Dataset = None,
     data_root: DataRoot = None,
     weights: Weights = None,
@@ -25,7 +25,7 @@ def infer(
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
-    """Turn one driving scene into a global vector map."""
+    """Map one scene: driving log in, global vector map out."""
     from cli.console import err, progress_display, say_report, warn_of_weights
     from predmapnet.runs.outputs import Outputs
 

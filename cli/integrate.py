@@ -1,4 +1,4 @@
-"""``predmapnet integrate``: anybody's per-frame results into one map."""
+"""``predmapnet integrate``: fuse the per-frame results of any detector into one map."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 def integrate(
     frames: Annotated[
         Path,
-        typer.Argument(help="Per-frame results: .parquet of --save-frames, or .json of MapTracker, MapTR and kin."),
+        typer.Argument(
+            help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR and the like."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
     poses: Annotated[
@@ -24,21 +26,22 @@ def integrate(
     location: Annotated[
         str | None,
         typer.Option(
-            help="Where the poses' frame lies, if the frames do not say it: a nuScenes map or Argoverse 2 city (PIT)."
+            help="Frame of the poses, unless the results name it: a nuScenes map or an Argoverse 2 city (PIT)."
         ),
     ] = None,
     origin: Annotated[
-        str | None, typer.Option(help="Or latitude,longitude of its origin, x pointing east: 49.01,8.41.")
+        str | None,
+        typer.Option(help="Or the origin of that frame (x east, y north): latitude,longitude, as in 49.01,8.41."),
     ] = None,
-    roi: Annotated[str, typer.Option(help="What the detector looked at, metres along x and y.")] = "60x30",
+    roi: Annotated[str, typer.Option(help="Region of interest of the detector, metres along x and y.")] = "60x30",
     min_score: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="For results without track ids: use elements from this score on.")
+        float, typer.Option(min=0.0, max=1.0, help="Lowest score that is used, for results without track ids.")
     ] = 0.4,
     y_forward: Annotated[
         bool, typer.Option("--y-forward", help="The results' x points right and y forward (MapTR on nuScenes).")
     ] = False,
 ) -> None:
-    """Fuse what any detector saw, frame by frame, into one map."""
+    """Fuse the per-frame results of any detector into one map."""
     from cli.console import out as screen
     from cli.console import say_warning
     from mapfusion.elements import ElementKind
@@ -52,7 +55,7 @@ def integrate(
     Outputs(map=out).check()
     region = _region(roi)
     if location is not None or origin is not None:
-        _georeference(location, origin)  # a mistake there is told before the work begins
+        _georeference(location, origin)  # a wrong option is reported before the work begins
     done = integrate_file(frames, poses, region, min_score, y_forward)
     synthetic = done.synthetic and location is None
     georeference = _georeference(location or (None if origin else done.location), origin, synthetic)
@@ -70,7 +73,7 @@ def integrate(
     for note in done.notes:
         say_warning(note)
     for reason, count in done.rejections.items():
-        say_warning(f"the integrator left out {count} x {reason}")
+        say_warning(f"the integrator rejected {count} x {reason}")
     counts = ", ".join(f"{len(done.map.of_kind(kind))} {kind.label}" for kind in ElementKind)
     screen.print(f"{done.frames} frames of {len(done.logs)} drives: {counts}", markup=False)
     screen.print(f"written: {out}", markup=False)
@@ -107,6 +110,10 @@ def _georeference(location: str | None, origin: str | None, synthetic: bool = Fa
     found = georeference_of(location or "", synthetic)
     if found is None:
         known = ", ".join([*NUSCENES_ORIGINS, *ARGOVERSE2_CITIES])
-        where = f"the location '{location}' is not known" if location else "nobody knows where on Earth the poses lie"
+        where = (
+            f"the location '{location}' is not known"
+            if location
+            else "the results do not say where on Earth the poses lie"
+        )
         raise UserError(f"{where}: give --location (one of {known}) or --origin latitude,longitude")
     return found

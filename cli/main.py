@@ -1,6 +1,6 @@
-"""The command line: one file per command, and one place where errors become messages.
+"""Entry point of the command line: the commands, and the messages and exit codes of errors.
 
-Exit codes: 0 done, 1 some scenes of a batch failed, 2 a mistake or broken input (one message says which),
+Exit codes: 0 done, 1 some scenes of a batch failed, 2 a wrong option or broken input (the message names it),
 3 a fault of PredMapNet itself, 130 stopped with Ctrl-C.
 """
 
@@ -70,7 +70,7 @@ def options(
 
 
 def main() -> None:
-    """Run a command; turn what the user can put right into one message and an exit code."""
+    """Run a command; turn errors into one message and an exit code."""
     try:
         app()
     except SystemExit as end:
@@ -86,7 +86,7 @@ def main() -> None:
         _fail(f"{(error.strerror or str(error)).lower()}{where}", error)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        _fail(f"this is a fault of PredMapNet ({reason}); predmapnet --debug ... shows where it comes from", error, 3)
+        _fail(f"this is a bug in PredMapNet ({reason}); predmapnet --debug ... shows the traceback", error, 3)
 
 
 def _fail(message: str, error: Exception, code: int = 2) -> NoReturn:

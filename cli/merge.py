@@ -1,4 +1,4 @@
-"""``predmapnet merge``: maps of many drives made into one."""
+"""``predmapnet merge``: merge the maps of many drives."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ if TYPE_CHECKING:
 
 
 def merge(
-    maps: Annotated[list[Path], typer.Argument(help="Maps of one city, any order; a folder stands for those in it.")],
+    maps: Annotated[list[Path], typer.Argument(help="Maps of one city, in any order; a folder means all maps in it.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write.")],
-    tile: Annotated[float, typer.Option(min=50.0, help="Side of a tile, metres; memory depends on it.")] = 200.0,
+    tile: Annotated[
+        float, typer.Option(min=50.0, help="Side of a tile, metres; larger tiles need more memory.")
+    ] = 200.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
     style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
 ) -> None:
-    """Merge the maps of many drives: offsets between drives taken out, evidence added up."""
+    """Merge the maps of many drives: drives are aligned where that is certain, evidence is added up."""
     from cli.console import out as screen
     from cli.console import progress_display, say_warning
     from mapfusion.formats.by_suffix import check_suffix

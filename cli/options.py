@@ -1,4 +1,4 @@
-"""Options that several commands share, so that they are called the same everywhere."""
+"""Options shared by several commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Scheme(StrEnum):
 Dataset = Annotated[
     str | None,
     typer.Option(
-        help="nuscenes, argoverse2 or demo; or set PREDMAPNET_DATASET. The demo world if nothing is configured.",
+        help="nuscenes, argoverse2 or demo; or set PREDMAPNET_DATASET. Default: the demo world.",
     ),
 ]
 DataRoot = Annotated[
@@ -29,18 +29,16 @@ DataRoot = Annotated[
 ]
 SplitScheme = Annotated[
     Scheme,
-    typer.Option(help="Which splits: old (the data set's own) or new (geographically disjoint, of StreamMapNet)."),
+    typer.Option(help="Splits: old (the data set's own) or new (StreamMapNet's, geographically disjoint)."),
 ]
 OfficialFrames = Annotated[
     bool,
     typer.Option(
         "--official-frames",
-        help="Argoverse 2: the very frames of the published benchmarks, counted across all logs of the split.",
+        help="Argoverse 2: exactly the frames of the published benchmarks, counted across all logs of a split.",
     ),
 ]
-Weights = Annotated[
-    Path | None, typer.Option(help="Checkpoint (safetensors). By default the one that comes with PredMapNet.")
-]
+Weights = Annotated[Path | None, typer.Option(help="Checkpoint (.safetensors). Default: the shipped one.")]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
 PrecisionOption = Annotated[
     Precision,
@@ -60,5 +58,6 @@ Compile = Annotated[
 ]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
 AllowMissingCameras = Annotated[
-    bool, typer.Option("--allow-missing-cameras", help="Go on where a camera has no image, instead of stopping.")
+    bool,
+    typer.Option("--allow-missing-cameras", help="Map frames without the images of some cameras, instead of stopping."),
 ]

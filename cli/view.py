@@ -27,9 +27,9 @@ def view(
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
-    """Open Rerun: live while a scene is mapped, or with a recording or a map.
+    """Open a scene (live, while it is mapped), a recording or a map in Rerun.
 
-    Without a display, a scene or map is written to a recording, and the command says how to look at it.
+    Without a display, a recording is written instead, and the command prints how to open it.
     """
     from cli.console import err, progress_display, say_report, warn_of_weights
     from cli.viewer import Viewer

@@ -1,4 +1,4 @@
-"""Where a recording is looked at: a window, a web browser, or later, from a file."""
+"""Viewers of recordings: a window, a web browser, or a file for later."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRPC_PORT_OFFSET = 1
 
 
 def web_address(port: int) -> str:
-    """Address of a web viewer that shows what is served beside it."""
+    """Return the address of a web viewer and its data."""
     data = urllib.parse.quote(f"rerun+http://localhost:{port + GRPC_PORT_OFFSET}/proxy", safe="")
     return f"http://localhost:{port}?url={data}"
 
@@ -36,10 +36,10 @@ def has_display() -> bool:
 
 @dataclass(frozen=True)
 class Viewer:
-    """A Rerun stream that somebody looks at.
+    """An open viewer.
 
     Attributes:
-        recording: log into it.
+        recording: the Rerun stream to log into.
     """
 
     recording: rr.RecordingStream
@@ -54,7 +54,7 @@ class Viewer:
             web: serve on ``port`` until Ctrl-C.
             port: of the web viewer.
             file: write a recording here instead.
-            live: something is mapped in the block, so that it is worth looking before the block ends.
+            live: whether there is something to watch before the block ends.
         """
         recording = rr.RecordingStream(APPLICATION, recording_id=name)
         if web:
@@ -83,7 +83,7 @@ class Viewer:
 
     @staticmethod
     def show_file(path: Path, web: bool, port: int) -> None:
-        """Open a finished recording, or say how to do so where there is no display."""
+        """Open a finished recording; without a display, print how to."""
         if not path.is_file():
             raise UserError(f"there is no recording {path}")
         command = [sys.executable, "-m", "rerun", str(path)]

@@ -1,4 +1,4 @@
-"""``predmapnet weights``: import public weights, and see what a file holds."""
+"""``predmapnet weights``: import public weights, inspect weights files."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ if TYPE_CHECKING:
     from predmapnet.weights.inspection import WeightsInfo
     from predmapnet.weights.maptracker_import import ImportReport
 
-weights = typer.Typer(
-    name="weights", help="Import public weights, and see what a weights file holds.", no_args_is_help=True
-)
+weights = typer.Typer(name="weights", help="Import public weights, inspect weights files.", no_args_is_help=True)
 
 
 @weights.command("import")
 def import_weights(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint that MapTracker published (.pth).", metavar="FILE")],
+    checkpoint: Annotated[Path, typer.Argument(help="Published checkpoint of MapTracker (.pth).", metavar="FILE")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write (.safetensors).")],
     preset: Annotated[
         str | None,
@@ -28,7 +26,7 @@ def import_weights(
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the modules of the paper, which MapTracker has no weights for.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the paper's modules, for which MapTracker has no weights.")] = 0,
 ) -> None:
     """Turn a MapTracker checkpoint into weights for PredMapNet.
 
@@ -70,7 +68,7 @@ def inspect_weights(
     ] = None,
     names: Annotated[bool, typer.Option("--names", help="List every tensor.")] = False,
 ) -> None:
-    """Show what a weights file holds: the network, its modules and parts, and where it comes from."""
+    """Show the content of a weights file: network, modules, parts and origin."""
     from predmapnet.weights.inspection import inspect_file
 
     _say_weights(inspect_file(file), names)

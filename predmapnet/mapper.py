@@ -61,7 +61,7 @@ class Mapper:
     Attributes:
         config: of the network.
         weights_sha256: of the file that the weights came from; empty for a network that was made in memory.
-        facts: what the weights file tells of its training (:class:`predmapnet.weights.checkpoint.Checkpoint`).
+        facts: about the training, from the weights file (:class:`predmapnet.weights.checkpoint.Checkpoint`).
         precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.kernels.low_precision`).
         compiled: whether these two are compiled.
     """
@@ -144,8 +144,8 @@ class Mapper:
 
         Args:
             frame: the next of its log.
-            state: what the step before returned; None begins a log.
-            images: what :meth:`read_images` returned for this frame, if it was called ahead; read here otherwise.
+            state: returned by the step before; None begins a log.
+            images: of this frame, if :meth:`read_images` was called ahead; read here otherwise.
             allow_missing_cameras: as in :meth:`read_images`.
 
         Returns:
@@ -176,7 +176,7 @@ class Mapper:
         return replace(frame_map, visible=ground_in_view(working, self.roi)), state
 
     def _lookup(self, rig: Rig) -> RigGeometry:
-        """Return the look-up of a rig, from the few that were used last."""
+        """Return the look-up of a rig; the last few are kept."""
         for position, (known, lookup) in enumerate(self._lookups):
             if known is rig or _same_rig(known, rig):
                 self._lookups.insert(0, self._lookups.pop(position))
@@ -187,7 +187,7 @@ class Mapper:
 
 
 def choose_device(name: str) -> torch.device:
-    """Turn the user's choice into a device.
+    """Return the device of a name; ``auto`` is a GPU if there is one.
 
     Raises:
         UserError: there is no such device here.
@@ -241,10 +241,10 @@ def to_frame_map(
     timestamp: int,
     ego_to_global: Float,
 ) -> FrameMap:
-    """Everything that is reported of one frame of one stream: tracks first, then detections without a track.
+    """Return the frame map of one stream: tracks first, then detections without a track.
 
     Args:
-        selection: what :func:`predmapnet.network.track_selection.select` chose.
+        selection: result of :func:`predmapnet.network.track_selection.select`.
         state: after the frame.
         segmentation: ``(1, 3, H_s, W_s)`` logits.
         config: of the network.

@@ -28,7 +28,7 @@ than with the truth. The common part was chosen on the validation towns of the d
 """
 
 MapSnapshot = Callable[[], GlobalMap]
-"""Gives the global map as it is now; costs time that grows with the map, so ask seldom."""
+"""Returns the global map as it is now; its cost grows with the map, so it is for every few frames."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Step:
     """One frame, mapped.
 
     Attributes:
-        frame: what the car saw.
-        frame_map: what the mapper made of it, rasters included.
+        frame: pose, calibration and images.
+        frame_map: its map, rasters included.
         milliseconds: by stage: ``images`` (waiting for them), ``network``, ``integration``.
         fused: whether the integrator accepted the frame.
     """
@@ -74,7 +74,7 @@ class SceneRun:
         frame_maps: one per frame, without rasters.
         seconds: wall time from the first image to the last frame.
         milliseconds: mean per frame, by stage.
-        rejections: what the integrator left out and why, counted by reason.
+        rejections: of the integrator, counted by reason.
         observed: ground that the cameras saw in the fused frames, global frame, metres.
     """
 

@@ -74,7 +74,7 @@ def ground_in_view(cameras: Iterable[Camera], roi: RegionOfInterest) -> tuple[Fl
 
 @dataclass(frozen=True)
 class Frame:
-    """What the car saw at one instant.
+    """One instant of a log: pose, calibration and images.
 
     Attributes:
         scene: name of the scene.
@@ -84,7 +84,7 @@ class Frame:
         ego_to_global: ``(4, 4) float64``; on nuScenes the ego origin lies at the lidar's x, y, as in the
             official vector-map data sets.
         rig: the cameras of the car, always all of them.
-        images: where each camera's image lies, by camera name. A camera without an image is absent.
+        images: image files by camera name. A camera without an image is absent.
     """
 
     scene: str
@@ -98,7 +98,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Instant:
-    """When and where a frame was taken; known without calibration and images.
+    """Time and pose of a frame, known without calibration and images.
 
     Attributes:
         token: the data set's own unique name of the frame.
@@ -132,7 +132,7 @@ class SceneInfo:
     """One line of ``predmapnet scenes``.
 
     Attributes:
-        name: what the user types.
+        name: as users type it.
         split: ``train``, ``val`` or ``test``.
         frames: number of key frames.
         location: town, city or map name.
@@ -163,7 +163,7 @@ class Scene(Protocol):
 
     @property
     def georeference(self) -> Georeference | None:
-        """Where the global frame lies on Earth, if that is known."""
+        """Georeference of the global frame, if it is known."""
         ...
 
     def __len__(self) -> int: ...
@@ -203,7 +203,7 @@ class SceneSource(Protocol):
 
     @property
     def root(self) -> Path:
-        """Where it lies."""
+        """Folder of the data set."""
         ...
 
     @property

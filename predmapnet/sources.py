@@ -1,4 +1,4 @@
-"""Which data set a command works on: what was asked for, or the demo world when nothing is configured.
+"""Choice of the data set: by option, environment or folder; the demo world when nothing is configured.
 
 Environment variables, each used only where the command line says nothing:
 
@@ -30,7 +30,7 @@ def open_source(
     split_scheme: str = "old",
     official_frames: bool = False,
 ) -> tuple[SceneSource, str]:
-    """Open the data set that was asked for.
+    """Open a data set.
 
     Args:
         dataset: ``nuscenes``, ``argoverse2`` or ``demo``; None asks the environment, then the folder itself.
@@ -40,10 +40,10 @@ def open_source(
             sweeps of each log from 0. nuScenes has only one kind of frames.
 
     Returns:
-        The source, and one plain sentence that says which data set it is and why.
+        The source, and a sentence for users: which data set it is and why.
 
     Raises:
-        UserError: what was asked for is missing or broken; there is no silent fallback.
+        UserError: the data set is missing or broken; there is no silent fallback.
     """
     check_scheme(split_scheme)
     source, sentence = _open(dataset, data_root, split_scheme, official_frames)
@@ -90,7 +90,7 @@ def _open(
 
 
 def _setting(argument: object, option: str, variable: str) -> tuple[str | None, str]:
-    """What the command line says, else the environment; and which of them it was."""
+    """Return the value of an option or else of the environment, and the name of the one that gave it."""
     if argument is not None:
         return str(argument), option
     return os.environ.get(variable) or None, variable

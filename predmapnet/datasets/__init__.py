@@ -1,1 +1,1 @@
-"""Where driving logs come from: one file per source behind one protocol, ground truth included."""
+"""Readers of data sets: one file per source of driving logs, ground truth included."""

@@ -56,7 +56,7 @@ class Argoverse2Source:
         name: ``argoverse2``.
         root: a log, or a folder of logs, or a folder with train, val and test folders of logs.
         synthetic: False.
-        stride: every how manieth lidar sweep is a frame.
+        stride: lidar sweeps per frame.
         split_scheme: ``old`` or ``new``.
         official_frames: whether frames are counted across logs.
     """
@@ -75,7 +75,7 @@ class Argoverse2Source:
 
         Args:
             root: see above.
-            stride: every how manieth lidar sweep of 10 Hz is a frame.
+            stride: lidar sweeps (10 Hz) per frame.
             split_scheme: ``old`` (the folder that a log lies in) or ``new`` (StreamMapNet's).
             official_frames: False counts the sweeps of each log from 0, so that a log's frames depend on nothing else.
                 True takes exactly the frames of the published benchmarks: sweeps without all images are dropped,
@@ -324,7 +324,7 @@ class Argoverse2Scene:
         return all_truths(self.ground_truth, poses, roi, cache, "argoverse2")
 
     def truth_map(self) -> GlobalMap | None:
-        """Return what a perfect mapper would have made of this log, or None for a log without a map."""
+        """Return the true map of this log, as a perfect mapper would make it; None for a log without a map."""
         if self.ground_truth is None:
             return None
         frames = [(int(self.timestamps[index]), self.pose(index)) for index in range(len(self))]

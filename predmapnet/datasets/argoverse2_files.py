@@ -1,4 +1,4 @@
-"""How an Argoverse 2 log lies on disk: which files it has, and how they are read."""
+"""Files of an Argoverse 2 log on disk, and their readers."""
 
 from __future__ import annotations
 

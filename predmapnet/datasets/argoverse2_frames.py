@@ -1,4 +1,4 @@
-"""Which lidar sweeps of Argoverse 2 the published vector-map benchmarks take as frames.
+"""Selection of lidar sweeps as frames, as in the published vector-map benchmarks on Argoverse 2.
 
 They keep every fourth sweep of 10 Hz, but count across logs, so a log's first frame depends on all logs before it.
 These rules need whole splits; a single log is read by the simple rule (its sweeps 0, 4, 8, ...) unless asked otherwise.

@@ -1,4 +1,4 @@
-"""From each data set's metric frame to longitude and latitude (WGS84)."""
+"""Georeferences of the data sets: from metric frames to longitude and latitude (WGS84)."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def georeference_of(location: str, synthetic: bool = False) -> SphereGeoreferenc
         synthetic: whether the place is made up; a made-up one never lies where a real one does.
 
     Returns:
-        The georeference, or None for a location that nobody knows.
+        The georeference, or None for an unknown location.
     """
     town = re.fullmatch(r"town-(\d{4})", location)
     if town is not None:

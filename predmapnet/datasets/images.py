@@ -1,4 +1,4 @@
-"""Read camera images, and notice when one is damaged."""
+"""Camera images; damaged ones are noticed."""
 
 from __future__ import annotations
 

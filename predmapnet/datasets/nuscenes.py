@@ -41,7 +41,7 @@ def find_versions(root: Path) -> tuple[str, ...]:
 
 
 def choose_version(root: Path, version: str | None) -> str:
-    """Choose the table folder to open: what was asked for, or trainval before others, mini only when alone.
+    """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
 
     Raises:
         UserError: nothing there, not what was asked for, or several without a clear first choice.
@@ -161,7 +161,7 @@ class NuScenesSource:
         }
 
     def _georeference(self, info: SceneInfo) -> Georeference | None:
-        """Where the map lies; rendered towns carry a borrowed location and belong into the ocean."""
+        """Return the georeference of a scene; rendered towns carry a borrowed location, but lie in the ocean."""
         if not self.synthetic:
             return nuscenes_georeference(info.location)
         marker = read_map_file(self.root / DEMO_MARKER)[0]
@@ -176,7 +176,7 @@ class NuScenesSource:
 
 @dataclass(frozen=True)
 class _KeyFrame:
-    """What the tables say about one sample."""
+    """Records of one sample."""
 
     token: str
     timestamp: int
@@ -209,7 +209,7 @@ class NuScenesScene:
             tables: of the version.
             info: the scene's line in the listing.
             ground_truth: its map, if there is one.
-            georeference: where the global frame lies on Earth, if that is known.
+            georeference: of the global frame, if it is known.
         """
         self.info = info
         self.ground_truth = ground_truth
@@ -346,7 +346,7 @@ class NuScenesScene:
         return combined(ego_to_global, lidar_to_ego)
 
     def lidar_path(self, index: int) -> Path | None:
-        """Where the lidar sweep of frame ``index`` lies, or None if the file is not there."""
+        """Return the lidar file of frame ``index``, or None if it is not there."""
         path = self._root / self._frames[index].sensors[LIDAR]["filename"]
         return path if path.is_file() else None
 
@@ -372,7 +372,7 @@ class NuScenesScene:
         return all_truths(self.ground_truth, poses, roi, cache, "nuscenes")
 
     def truth_map(self) -> GlobalMap | None:
-        """Return what a perfect mapper would have made of this scene, or None without a map expansion."""
+        """Return the true map of this scene, as a perfect mapper would make it; None without a map expansion."""
         if self.ground_truth is None:
             return None
         frames = [(self._frames[index].timestamp, self.lidar_to_global(index)) for index in range(len(self))]

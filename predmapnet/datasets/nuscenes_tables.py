@@ -1,4 +1,4 @@
-"""The tables of a nuScenes data set, read only as far as mapping needs them.
+"""Tables of a nuScenes data set, read only as far as mapping needs them.
 
 ``sample_data.json`` and ``ego_pose.json`` of v1.0-trainval hold 2.6 million records each, of which mapping wants
 the key frames of one scene at a time. They are searched as bytes, and only the records asked for are parsed.
@@ -34,7 +34,7 @@ class Tables:
     """One ``v1.0-*`` folder.
 
     Attributes:
-        folder: where the tables lie.
+        folder: of the tables.
     """
 
     folder: Path
@@ -83,7 +83,7 @@ class Tables:
 
     @cached_property
     def _key_frame_spans(self) -> dict[bytes, list[tuple[int, int]]]:
-        """Where the key-frame records of each sample lie in ``sample_data.json`` (byte ranges), radars left out."""
+        """Byte ranges of each sample's key-frame records in ``sample_data.json``, radars left out."""
         spans: dict[bytes, list[tuple[int, int]]] = {}
         with _mapped(self.path("sample_data")) as data:
             for start, end in _records_with(data, _KEY_FRAME):
@@ -112,7 +112,7 @@ class Tables:
 
     @cached_property
     def _pose_offsets(self) -> dict[bytes, int]:
-        """Where each record of a small ``ego_pose.json`` lies, or of a large one those of the lidar's key frames."""
+        """Byte offsets of the records of the lidar's key frames in ``ego_pose.json``."""
         with _mapped(self.path("sample_data")) as data:
             wanted = {
                 match.group(1)

@@ -1,4 +1,4 @@
-"""Poses as data sets store them: unit quaternions and translations, checked before they are believed."""
+"""Poses as data sets store them: unit quaternions and translations, with checks."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def combined(outer: Float, inner: Float) -> Float:
 
 
 def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], where: str) -> Float:
-    """Build a pose from what a file says.
+    """Build a pose from a quaternion and a translation.
 
     Args:
         rotation_wxyz: unit quaternion w, x, y, z.

@@ -1,1 +1,1 @@
-"""The metrics of the field and of the global map."""
+"""Metrics of the field and of the global map."""

@@ -47,7 +47,7 @@ def chamfer_average_precision(
 def chamfer_from_flags(
     frames: Sequence[EvaluationFrame], flags: Sequence[NDArray[np.int8]], thresholds: Thresholds
 ) -> AveragePrecision:
-    """Accumulate what :func:`frame_flags` found frame by frame, for example in several processes."""
+    """Accumulate the :func:`frame_flags` of frames, which may come from several processes."""
     truths = [sum(int((frame.truth.kinds == kind).sum()) for frame in frames) for kind in ElementKind]
     return accumulate(
         [frame.predicted.kinds for frame in frames],

@@ -83,7 +83,7 @@ def consistency_flags(
 
     Args:
         frames: all frames of the scene in order.
-        matched: what :func:`matched_tracks` found in them.
+        matched: their :func:`matched_tracks`.
         anchored: see :func:`consistency_average_precision`.
 
     Returns:

@@ -1,4 +1,4 @@
-"""How well the short-term forecast foresees where an element will be, beside what costs nothing.
+"""Errors of the short-term forecasts, beside those of trivial baselines.
 
 An element that is tracked at t is compared, point by point, with the truth that its track finds at t + 1 and t + 2.
 Three forecasts compete: the network's (at t + 2 continued at constant velocity, since it looks one instant ahead),

@@ -1,4 +1,4 @@
-"""What every per-frame metric takes: a prediction beside its ground truth, checked once."""
+"""Input of the per-frame metrics: predictions and ground truth, checked once."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ Integer = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class EvaluationFrame:
-    """One instant as the metrics see it.
+    """Prediction and ground truth of one instant.
 
     Attributes:
         scene: name of the scene.
         index: position in the scene, from 0; the frames of a scene are consecutive.
-        predicted: what was predicted, in the ego frame.
+        predicted: in the ego frame.
         truth: ground truth of the same ROI, in the ego frame, not simplified.
 
     Raises:

@@ -1,9 +1,9 @@
-"""How good the map of a whole drive is: length-weighted precision and recall, whole elements, lateral error.
+"""Quality of the map of a whole drive: length-weighted precision and recall, whole elements, lateral error.
 
 Both maps are cut into samples every 0.25 m, each of which stands for its share of the line. A predicted sample is
 right if a true line of its kind runs within the threshold (exact distance to the line); a true sample is found if a
-predicted line does. Crossings count as their outlines. Truth that the car never came near enough to see is not
-asked for: recall and whole elements are counted inside the union of the regions of interest along the drive.
+predicted line does. Crossings count as their outlines. Truth that the car never came near is left out: recall and
+whole elements are counted inside the union of the regions of interest along the drive.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SHORTEST_PART = 1.0
 
 @dataclass(frozen=True)
 class KindQuality:
-    """What was counted for one kind (or for all), in one scene or pooled over several.
+    """Counts of one kind (or of all), in one scene or pooled over several.
 
     Attributes:
         right: ``(t,)`` predicted metres within each threshold of a true line.
@@ -47,7 +47,7 @@ class KindQuality:
         fragments: predicted elements that follow a true element.
         followed: true elements that at least one predicted element follows.
         duplicates: fragments that mostly repeat stretches which a more confident fragment covers.
-        predicted_elements, true_elements: how many there are.
+        predicted_elements, true_elements: numbers of elements.
     """
 
     right: Float
@@ -105,7 +105,7 @@ class GlobalMapQuality:
     Attributes:
         kinds: one entry per :class:`mapfusion.ElementKind`.
         elements: average precision of whole elements by chamfer distance, confidence as the score.
-        scores, flags, element_kinds: what ``elements`` was accumulated from, for pooling.
+        scores, flags, element_kinds: the input of ``elements``, for pooling.
     """
 
     kinds: tuple[KindQuality, ...]
@@ -154,7 +154,7 @@ def global_map_quality(
     Args:
         predicted: the map; the confidence of an element is its score.
         truth: the true map in the same global frame, not clipped.
-        seen: where truth is asked for (see :func:`seen_area`); everywhere if None.
+        seen: area in which truth counts (see :func:`seen_area`); everywhere if None.
 
     Returns:
         Counts and figures per kind and overall.

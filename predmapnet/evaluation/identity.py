@@ -1,4 +1,4 @@
-"""Id switches and track lengths: does an element keep its track id while it is in view?"""
+"""Id switches and track lengths of true elements while they are in view."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Integer = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class IdentityCounts:
-    """What was counted in one scene, or pooled over several.
+    """Counts of one scene, or pooled over several.
 
     Attributes:
-        switches: how often a true track was found by another predicted track than the last time.
-        matches: how often a true track was found at all.
-        truths: how often one was there to be found.
+        switches: changes of the predicted track that finds a true track.
+        matches: true elements found, over all frames.
+        truths: true elements, over all frames.
         track_lengths: frames in which each predicted track was reported.
         true_track_lengths: the same for true tracks.
     """

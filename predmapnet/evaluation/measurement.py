@@ -1,4 +1,4 @@
-"""Everything that is measured of one scene, and of all scenes together."""
+"""All measurements of one scene, and the figures over all scenes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Flags = NDArray[np.int8]
 
 @dataclass(frozen=True)
 class SceneMeasurement:
-    """What was decided element by element in one scene; figures come from pooling scenes.
+    """Measurements of one scene, element by element; figures come from pooling scenes.
 
     Attributes:
         frames: the frames that were measured, in order.
@@ -152,7 +152,7 @@ def measure_scene(
 
 
 def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
-    """Put scenes together; their order decides equal scores.
+    """Pool scenes; their order breaks ties of scores.
 
     Raises:
         UserError: there is no scene, or the scenes were mapped with different regions of interest.

@@ -1,4 +1,4 @@
-"""From true-positive flags to precision-recall curves and average precision, as MapTR and MapTracker count."""
+"""Precision-recall curves and average precision from true-positive flags, as MapTR and MapTracker count."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class KindResult:
     """Average precision of one kind.
 
     Attributes:
-        kind: which one.
+        kind: of the elements.
         curves: one per threshold.
-        truths, predictions: how many elements were counted.
+        truths, predictions: numbers of elements.
     """
 
     kind: ElementKind

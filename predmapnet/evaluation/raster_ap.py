@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
 Mask = NDArray[np.uint8]
 Axes = Literal["mapvr", "ego"]
-"""Which way the canvas lies: ``mapvr`` has x to the right and y forward, as MapVR draws it; ``ego`` x forward.
+"""Axes of the canvas: ``mapvr`` has x to the right and y forward, as MapVR draws it; ``ego`` x forward.
 Rounding makes a difference in the third digit."""
 
 PIXELS_PER_METRE = 8
@@ -39,7 +39,7 @@ _RECALLS: Float = np.linspace(0.0, 1.0, 101)
 
 @dataclass(frozen=True)
 class RasterMatches:
-    """What was found for one kind in one frame.
+    """Matches of one kind in one frame.
 
     Attributes:
         rows: ``(n,)`` rows of the frame's predictions that count, in descending score.
@@ -66,7 +66,7 @@ class RasterKindResult:
     """Figures of one kind; None where the kind has no ground truth at all.
 
     Attributes:
-        kind: which one.
+        kind: of the elements.
         thresholds: ``(6,)`` overlaps.
         average_precisions: ``(6,)`` one per threshold.
         recalls: highest recall ``(6,)`` by the number of detections that may count per frame (1, 10, 100).

@@ -1,4 +1,4 @@
-"""What an evaluation leaves behind: figures in JSON, and one HTML file that needs nothing else to be read."""
+"""Reports of an evaluation: figures in JSON, and a self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write_figures(path: Path, figures: Mapping[str, Any], context: Mapping[str, 
     Args:
         path: the file; its folder exists.
         figures: see :meth:`predmapnet.evaluation.measurement.Measurement.figures`.
-        context: what was measured; written under ``evaluated``.
+        context: data set and scenes; written under ``evaluated``.
 
     Raises:
         UserError: the file cannot be written.
@@ -52,7 +52,7 @@ def write_report(path: Path, measurement: Measurement, context: Mapping[str, Any
 
     Args:
         path: the file; its folder exists.
-        measurement: what was measured.
+        measurement: over all scenes.
         context: ``dataset``, ``split``, ``synthetic``.
 
     Raises:

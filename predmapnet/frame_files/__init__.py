@@ -1,1 +1,1 @@
-"""Readers and writers of per-frame results and poses."""
+"""Files of per-frame results and poses: readers and writers."""

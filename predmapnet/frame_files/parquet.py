@@ -1,4 +1,4 @@
-"""Per-frame results in Parquet: what the mapper said of every instant, one row per frame.
+"""Per-frame results in Parquet, one row per frame.
 
 Schema, version 1 (``predmapnet_frames`` in the file's metadata; ``predmapnet_provenance`` beside it is JSON):
 
@@ -72,9 +72,9 @@ class StoredFrame:
     """One row of a file.
 
     Attributes:
-        scene, index: which frame.
+        scene, index: of the frame.
         token: the data set's own name of it, empty if it was not stored.
-        frame_map: what was seen, without rasters.
+        frame_map: without rasters.
     """
 
     scene: str
@@ -85,7 +85,7 @@ class StoredFrame:
 
 @dataclass(frozen=True)
 class StoredFrames:
-    """A file that was read: its frames in file order and where they came from."""
+    """Content of a file: its frames in file order, and their provenance."""
 
     frames: tuple[StoredFrame, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class StoredFrames:
 
 
 class FrameWriter:
-    """Writes frames as they come; the file appears under its name only when all went well.
+    """Writer of frames as they come; the file appears under its name only if all goes well.
 
     Use it as a context manager. An exception inside leaves no file.
 
@@ -215,7 +215,7 @@ def refuse_pickle(path: Path) -> None:
 
 
 def _open_table(path: Path, **selection: Any) -> pa.Table:
-    """Read what is asked for, after the schema has been found to be ours."""
+    """Read a selection of a file whose schema is ours."""
     if not path.is_file():
         raise UserError(f"There is no file {path}.")
     refuse_pickle(path)

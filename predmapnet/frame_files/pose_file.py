@@ -1,4 +1,4 @@
-"""Poses of frames from a file: JSON or CSV, by token."""
+"""Pose files in JSON or CSV: poses of frames by token."""
 
 from __future__ import annotations
 

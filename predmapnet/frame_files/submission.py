@@ -34,7 +34,7 @@ Float = NDArray[np.float64]
 Integer = NDArray[np.int64]
 
 _ENOUGH_TO_JUDGE = 10
-"""Elements; if so many lie between 0 and 1 m, all of them, the file holds normalised points."""
+"""Number of elements from which on a file whose points all lie in [0, 1] is taken to be normalised."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class SubmittedFrame:
     visible: tuple[Float, ...] | None = None
 
     def at(self, instant: Instant, roi: RegionOfInterest) -> FrameMap:
-        """Put the elements where and when the data set says that the frame was taken."""
+        """Return the elements as a frame map with the time and pose of an instant."""
         return FrameMap(
             instant.timestamp,
             instant.ego_to_global,
@@ -73,7 +73,7 @@ NOTHING = SubmittedFrame(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, d
 
 
 def position_name(scene: str, index: int) -> str:
-    """How a frame is called in :func:`read_submission` if the file names its scene and its place in it."""
+    """Return the name of a frame in :func:`read_submission` if the file gives its scene and its index there."""
     return f"{scene}/{index}"
 
 
@@ -135,7 +135,7 @@ def is_maptr(results: Any) -> bool:
 
 
 def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
-    """Give the name and the entry of each frame, whichever layout it is."""
+    """Yield the name and the entry of each frame, in either layout."""
     if isinstance(results, dict):
         yield from results.items()
     elif isinstance(results, list):

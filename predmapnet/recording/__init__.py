@@ -1,4 +1,4 @@
-"""The bridge to Rerun: a run of the mapper as a recording that a person understands at once."""
+"""Recordings of runs and maps for the Rerun viewer."""
 
 from predmapnet.recording.file_sink import RecordingFile
 from predmapnet.recording.map_view import log_map_file

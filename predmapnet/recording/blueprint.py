@@ -22,7 +22,7 @@ CAMERA_ORDER = (
     "ring_rear_left",
     "ring_rear_right",
 )
-"""How people expect the cameras to be laid out: as one looks around, front row first."""
+"""Order of the camera views: as one looks around, front row first."""
 
 BACKGROUND = (14, 16, 20)
 

@@ -19,7 +19,7 @@ from predmapnet.files import write_file
 
 
 class RecordingFile:
-    """Sends a recording to ``path``; the file appears, whole, when the ``with`` block ends well."""
+    """File of a recording; it appears, whole, when the ``with`` block ends well."""
 
     def __init__(self, recording: rr.RecordingStream, path: Path) -> None:
         self._recording = recording

@@ -40,7 +40,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
 
     Args:
         points: ``(n, 2)``, metres, ego frame, on the plane z = 0.
-        camera: where it looks.
+        camera: of the picture.
         spacing: distance between projected points, metres.
 
     Returns:
@@ -77,7 +77,7 @@ def bev_pixels(points: Float, roi: RegionOfInterest, shape: tuple[int, int]) -> 
 
     Args:
         points: ``(n, 2)``, metres, ego frame.
-        roi: what the raster covers.
+        roi: region of the raster.
         shape: rows and columns.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Write what happens at each frame to Rerun.
+"""Recorder of a run: cameras, tracks, forecasts and the growing map, frame by frame, in Rerun.
 
 Entities carry the names that nuScenes' users know: ``world/ego_vehicle/CAM_FRONT`` and so on. The recording is flat,
 as the map is: heights of the car are left out, its roll and pitch too. It begins at the first position of the car,
@@ -32,7 +32,13 @@ STAGES = {"images": "waiting for images", "network": "network", "integration": "
 
 
 class SceneRecorder:
-    """An observer of :func:`predmapnet.runs.infer.map_scene` that draws into a Rerun recording."""
+    """Observer of :func:`predmapnet.mapping.map_scene` that logs to Rerun.
+
+    Args:
+        recording: the stream to log into.
+        description: of the run, Markdown, shown beside the views.
+        live: whether someone watches while the scene is mapped; the viewer then follows the newest frame.
+    """
 
     def __init__(self, recording: rr.RecordingStream, description: str, live: bool = False) -> None:
         self._recording = recording

@@ -1,1 +1,1 @@
-"""The run behind each command, without the command line."""
+"""Runs behind the commands: infer, batch, evaluate and integrate as functions."""

@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BatchSettings:
-    """How every scene of a batch is mapped; the same for all, and sent to the processes.
+    """Settings of a batch, the same for all scenes and processes.
 
     Attributes:
         dataset, data_root: name and folder of the source that was opened.
-        network: its weights and how it computes.
+        network: as for a single scene.
         allow_missing_cameras: go on where a camera has no image.
-        recordings, frames: write these files too.
+        recordings, frames: whether these files are written, too.
         threads: CPU threads of each process.
     """
 
@@ -65,14 +65,14 @@ class BatchSettings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one scene.
+    """Outcome of one scene.
 
     Attributes:
         scene: its name.
         status: ``done``, ``done before`` or ``failed``.
         seconds: wall time; of the earlier run for ``done before``.
         report: as in :class:`predmapnet.runs.infer.SceneReport`, None if it failed.
-        reason: why it failed.
+        reason: of a failure.
     """
 
     scene: str
@@ -102,7 +102,7 @@ def choose_scenes(source: SceneSource, names: Sequence[str], split: str | None) 
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the output folder if need be, and find out whether files can be written there. Raises UserError."""
+    """Create the output folder if need be, and check that files can be written there. Raises UserError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -111,7 +111,7 @@ def prepare_folder(folder: Path) -> None:
 
 
 class BatchJournal:
-    """Collects outcomes: one JSON line each in ``log.jsonl`` as they come, all in ``summary.json`` at the end."""
+    """Journal of a batch: one JSON line per outcome in ``log.jsonl`` at once, all in ``summary.json`` at the end."""
 
     def __init__(self, folder: Path) -> None:
         self.outcomes: list[Outcome] = []
@@ -134,7 +134,7 @@ class BatchJournal:
 
 
 def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
-    """Name the settings that decide what a map looks like; a scene made with others is made again."""
+    """Return a hash of the settings that a map depends on; a scene made with others is mapped again."""
     deciding = [
         predmapnet.__version__,
         weights_sha256,
@@ -148,12 +148,12 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
 
 
 def summary_path(folder: Path, scene: str) -> Path:
-    """Name of the file whose presence says that a scene is done."""
+    """Return the file whose presence marks a scene as done."""
     return folder / f"{scene}.summary.json"
 
 
 def finished_before(scene: str, folder: Path, settings: BatchSettings, fingerprint: str) -> Outcome | None:
-    """Return what an earlier run left of a scene, or None if it has to be mapped."""
+    """Return the outcome of an earlier run, or None if the scene has to be mapped."""
     path = summary_path(folder, scene)
     if not path.is_file() or not all(file.is_file() for file in settings.outputs(scene, folder).paths):
         return None
@@ -166,11 +166,11 @@ def finished_before(scene: str, folder: Path, settings: BatchSettings, fingerpri
 def map_scenes(
     scenes: Sequence[str], folder: Path, settings: BatchSettings, jobs: int, weights_sha256: str
 ) -> Iterator[Outcome]:
-    """Map scenes and give each outcome as it comes: first those of an earlier run, then the new ones.
+    """Map scenes and yield outcomes as they come: first those of an earlier run, then the new ones.
 
     Args:
         scenes: names.
-        folder: where the maps go; it exists.
+        folder: of the maps; it exists.
         settings: the same for all.
         jobs: number of processes.
         weights_sha256: of the weights that ``settings`` name.
@@ -253,7 +253,7 @@ def _map_one(scene: str, folder: Path, settings: BatchSettings, fingerprint: str
     except UserError as error:
         return Outcome(scene, "failed", perf_counter() - start, reason=str(error))
     except Exception as error:
-        # One scene's surprise must not end the others; the log keeps where it came from.
+        # An unexpected error in one scene must not end the others; the log keeps its traceback.
         trace = traceback.format_exc(limit=-3)
         return Outcome(scene, "failed", perf_counter() - start, reason=f"{type(error).__name__}: {error}\n{trace}")
 

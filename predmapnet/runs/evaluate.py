@@ -1,4 +1,4 @@
-"""Where the results of a scene come from: mapped now, or read from what an earlier run or another method wrote."""
+"""Evaluation of scenes: mapped now, or read from the files of an earlier run or another method."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class EvaluationSettings:
     """Settings of an evaluation, the same for all scenes and processes.
 
     Attributes:
-        dataset, data_root: where frames, poses and ground truth come from.
+        dataset, data_root: source of frames, poses and ground truth.
         split_scheme, official_frames: see :func:`predmapnet.sources.open_source`.
         results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
-        network: that maps.
-        roi: region of a submission, which does not say it itself.
+        network: of scenes that are mapped.
+        roi: region of a submission, which does not state it.
         threads: CPU threads of each process.
         cache: folder that keeps the ground truth; None computes it anew.
     """
@@ -92,7 +92,7 @@ def measure_scenes(
     """Measure scenes one after the other or in several processes; they come in the order of ``scenes``.
 
     Args:
-        settings: what to measure.
+        settings: of the evaluation.
         scenes: names.
         jobs: number of processes.
         preparing: called while a scene is made ready (with one process only).
@@ -201,7 +201,7 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
 
 
 def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
-    """What a submission says of each frame of a scene; a frame that it does not name holds no prediction."""
+    """Return a submission's predictions for each frame of a scene; a frame that it lacks has none."""
     maps = []
     for index in range(len(scene)):
         instant = scene.instant(index)
@@ -212,7 +212,7 @@ def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -
 
 
 def _stored_maps(results: Path, scene: Scene) -> list[FrameMap]:
-    """What our own files say of each frame of a scene; a frame that they do not name holds no prediction."""
+    """Return the stored predictions for each frame of a scene; a frame that the file lacks has none."""
     name = scene.info.name
     path = results / f"{name}.parquet" if results.is_dir() else results
     stored = {frame.index: frame.frame_map for frame in read_frames(path, name).frames}
@@ -237,7 +237,7 @@ def _at(
 
 
 def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
-    """Fuse what was read as mapping would have; None if nothing is tracked."""
+    """Fuse frames as mapping does; None if nothing is tracked."""
     if not any((frame_map.track_ids >= 0).any() for frame_map in frame_maps):
         return None
     integrator = MapIntegrator(NETWORK_ERRORS)

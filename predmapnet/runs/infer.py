@@ -55,7 +55,7 @@ UNTRAINED_NOTE = (
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How a run compares with the ground truth.
+    """Accuracy of a run against the ground truth.
 
     Attributes:
         mean_ap: chamfer mAP of the frames at the thresholds of the benchmark.
@@ -69,17 +69,17 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What came of a scene, as shown in the table and written to summaries.
+    """Report of a mapped scene, as shown in the table and written to summaries.
 
     Attributes:
         scene: its name.
         elements, metres: per kind, by label.
-        frames: how many were mapped.
+        frames: number of frames.
         seconds: wall time of mapping, without preparing.
-        preparing_seconds: opening the scene; the demo world draws its pictures then.
+        preparing_seconds: of opening the scene; the demo world renders its images then.
         frames_per_second: of mapping.
         milliseconds: mean per frame, by stage.
-        rejections: what the integrator left out, by reason.
+        rejections: of the integrator, counted by reason.
         accuracy: None without ground truth.
         written: the files.
     """
@@ -139,7 +139,7 @@ class MappingPipeline:
         """Choose the source and load the network.
 
         Raises:
-            UserError: what was asked for is missing or broken.
+            UserError: the data set or the weights are missing or broken.
         """
         source, sentence = open_source(dataset, data_root)
         return cls(source, Mapper.from_checkpoint(network), sentence, allow_missing_cameras)
@@ -157,10 +157,10 @@ class MappingPipeline:
 
         Args:
             scene_name: as the source calls it.
-            outputs: where to write.
-            preparing: called while the scene is made ready.
+            outputs: files to write.
+            preparing: called while the scene is prepared.
             progress: called after each frame.
-            viewer: a Rerun stream to draw into while mapping.
+            viewer: a Rerun stream to log into while mapping.
 
         Raises:
             UserError: unknown scene, broken data, or a file that cannot be written.
@@ -174,7 +174,7 @@ class MappingPipeline:
         georeference = scene.georeference
         if georeference is None:
             where = scene.info.location
-            raise UserError(f"{scene_name} cannot be mapped: nobody knows where on Earth the location '{where}' lies")
+            raise UserError(f"{scene_name} cannot be mapped: the location '{where}' has no known place on Earth")
         with ExitStack() as files:
             observers: list[Observer] = []
             if viewer is not None:
@@ -196,7 +196,7 @@ class MappingPipeline:
         return MappedScene(run, _report(scene, run, accuracy, preparing_seconds, outputs))
 
     def provenance(self, scene: Scene) -> dict[str, Any]:
-        """Where the map of a scene comes from, as written into it. Names no path of this machine."""
+        """Return the provenance of a scene's map, as written into it. It names no path of this machine."""
         provenance: dict[str, Any] = {
             "generator": "predmapnet",
             "version": predmapnet.__version__,
@@ -216,12 +216,12 @@ class MappingPipeline:
 
     @property
     def note(self) -> str:
-        """What a reader of the map has to know about where it comes from; empty if nothing."""
+        """Caveats for readers of the map; empty if there are none."""
         return " ".join([SYNTHETIC_NOTE, self.warning] if self.source.synthetic else [self.warning]).strip()
 
     @property
     def warning(self) -> str:
-        """What the user of the command has to know about the weights; empty if nothing."""
+        """Caveats about the weights, for the user of the command; empty if there are none."""
         warnings = []
         if not self.source.synthetic and self.mapper.facts.get("data") == DemoSource.name:
             warnings.append(REAL_NOTE)
@@ -231,7 +231,7 @@ class MappingPipeline:
 
 
 class _ProgressObserver:
-    """Counts frames for a progress bar."""
+    """Observer that counts frames for a progress bar."""
 
     def __init__(self, progress: FrameProgress) -> None:
         self._progress = progress
@@ -268,7 +268,7 @@ def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | No
 
 
 def describe(provenance: Mapping[str, Any]) -> str:
-    """Tell in Markdown what a recording shows, for someone who finds the file."""
+    """Return a description of a recording in Markdown, for whoever finds the file."""
     note = f"\n\n**Note.** {provenance['note']}" if "note" in provenance else ""
     return f"""# {provenance["scene"]} ({provenance["dataset"]}){note}
 

@@ -1,4 +1,4 @@
-"""Anybody's per-frame results into one map: our Parquet, submissions of MapTracker and kin, results of MapTR."""
+"""Fusion of any detector's per-frame results: our Parquet, submissions of MapTracker and kin, results of MapTR."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_
 from predmapnet.mapping import NETWORK_ERRORS
 
 NAMED = 3
-"""So many tokens are named where many do not match."""
+"""Number of tokens that a message names."""
 
 
 @dataclass(frozen=True)
 class LoggedFrame:
-    """What was seen at one instant of one drive."""
+    """The frame map of one instant of one drive."""
 
     log: str
     frame_map: FrameMap
@@ -33,17 +33,17 @@ class LoggedFrame:
 
 @dataclass(frozen=True)
 class Integration:
-    """The map that came of frames, and what was left out.
+    """A map that was fused from per-frame results.
 
     Attributes:
         map: metric global frame.
-        frames: how many were fused.
+        frames: number of frames.
         logs: names of the drives.
-        rejections: what the integrator left out, by reason.
-        notes: what the user should know.
-        observed: ground that the frames looked at, metres.
-        location: of the data set, if the frames say it.
-        synthetic: whether the frames say that the place is made up.
+        rejections: of the integrator, counted by reason.
+        notes: for the user.
+        observed: ground seen in the fused frames, global frame, metres.
+        location: of the data set, if the frames name it.
+        synthetic: whether the frames are of the demo world.
     """
 
     map: GlobalMap

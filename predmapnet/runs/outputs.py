@@ -1,4 +1,4 @@
-"""What a run of one scene writes."""
+"""Output files of a run of one scene."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from predmapnet.files import check_output
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where a run writes; None for what is not wanted.
+    """Paths of the outputs; None for those that are not written.
 
     Attributes:
         map: GeoJSON, GeoPackage, FlatGeobuf or Lanelet2, by its ending.
         recording: Rerun recording.
-        frames: Parquet file of what each frame showed.
+        frames: per-frame results (Parquet).
     """
 
     map: Path | None = None
@@ -26,11 +26,11 @@ class Outputs:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files that will be there."""
+        """All paths that are written."""
         return tuple(path for path in (self.map, self.recording, self.frames) if path is not None)
 
     def check(self) -> None:
-        """Find out before the work begins whether all of it can be written. Raises UserError."""
+        """Check before the work begins that all of them can be written. Raises UserError."""
         for path in self.paths:
             check_output(path)
         if len({path.absolute() for path in self.paths}) < len(self.paths):

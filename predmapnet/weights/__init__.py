@@ -1,1 +1,1 @@
-"""The shipped checkpoint and what reads it."""
+"""Weights files: the shipped checkpoint, reading, writing, and import from MapTracker."""

@@ -1,4 +1,4 @@
-"""Checkpoints as safetensors files: the network's weights, its configuration, and how it was trained.
+"""Checkpoints as safetensors files: weights, configuration and facts about the training.
 
 Nothing is ever unpickled. The metadata of a file has one key, ``predmapnet`` (several would come in random order), with
 JSON: ``format``, ``version`` (of the package), ``configuration`` and ``facts`` (data, frames seen, scores).
@@ -33,7 +33,7 @@ class Checkpoint:
 
     Attributes:
         network: in evaluation mode, on the CPU, float32.
-        facts: how it was trained.
+        facts: about the training.
         version: of the package that wrote it.
         sha256: of the file.
     """
@@ -52,7 +52,7 @@ def save_checkpoint(
     Args:
         path: ends in ``.safetensors``.
         network: whose weights and configuration are written.
-        facts: how it was trained, JSON types only.
+        facts: about the training, JSON types only.
         half: store floating-point weights in 16 bits.
     """
     tensors = {}

@@ -1,4 +1,4 @@
-"""Weights files as files: where they lie, and how they are told apart."""
+"""Locate and hash weights files."""
 
 from __future__ import annotations
 

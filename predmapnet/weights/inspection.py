@@ -1,4 +1,4 @@
-"""What a weights file holds, without building a network of it."""
+"""Content of a weights file, read without building the network."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class WeightsInfo:
-    """What a file holds.
+    """Content of a weights file.
 
     Attributes:
         path: of the file.
         size: bytes.
-        about: what PredMapNet wrote beside the tensors: format, version, configuration and facts; empty for a file
+        about: metadata of PredMapNet: format, version, configuration and facts; empty for a file
             of another program.
         tensors: in the order of the file.
         sha256: of the file.

@@ -1,4 +1,4 @@
-"""Reads MapTracker's official checkpoints; nothing in the file is executed."""
+"""Import of MapTracker's official checkpoints; nothing in the file is executed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SHOWN_NAMES = 4
 
 @dataclass
 class ImportReport:
-    """What became of the entries of an official state dict.
+    """Treatment of each entry of an official state dict.
 
     Attributes:
         mapped: official name to name here.

@@ -1,4 +1,4 @@
-"""How the entries of MapTracker's official state dict are called here."""
+"""Names of MapTracker's state-dict entries in this package."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ _ALIAS = re.compile(r"head\.(cls|reg)_branches\.[1-9]\d*\.")
 
 
 def name_here(official: str) -> str | None:
-    """Return what an official entry is called here; None if no rule knows it.
+    """Return the name of an official entry here; None if no rule covers it.
 
     Example:
         >>> name_here("backbone.img_backbone.layer3.0.conv2.conv_offset.bias")

@@ -50,7 +50,7 @@ TILT_MARGIN = 5.0
 
 
 class Argoverse2GroundTruth:
-    """The vector map of one log, ready to be asked for the truth around any pose.
+    """The vector map of one log: the ground truth around any pose.
 
     What does not depend on the frame is done once: which lanes are valid, which boundaries repeat each other, and, for
     each set of lanes in view, the chained divider lines.

@@ -1,4 +1,4 @@
-"""Keep a scene's ground truth on disk, under a key made of everything that it depends on.
+"""Cache of ground truth on disk, keyed by everything that it depends on.
 
 A key that leaves something out goes stale unseen: annotation caches that outlived a change of their region or split
 have spoilt published figures. So the key covers the map's bytes, every pose, the region, the text of the code that
@@ -67,7 +67,7 @@ def cache_key(fingerprint: bytes, poses: Sequence[Float], roi: RegionOfInterest,
 
 
 class FrameByFrame(Protocol):
-    """What the ground truth of each data set offers for this."""
+    """Ground truth that can be asked for the truth around a pose."""
 
     fingerprint: bytes
 

@@ -1,4 +1,4 @@
-"""Read a map file and remember exactly which one it was."""
+"""Map files of data sets, read with a digest of their content."""
 
 from __future__ import annotations
 

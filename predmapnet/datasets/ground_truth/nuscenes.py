@@ -39,7 +39,7 @@ Records = list[dict[str, Any]]
 
 
 class NuScenesGroundTruth:
-    """One map of nuScenes, ready to be asked for the truth around any pose.
+    """One map of nuScenes: the ground truth around any pose.
 
     Geometry is indexed once; a frame touches only what lies near it.
 

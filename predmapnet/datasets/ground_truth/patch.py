@@ -1,4 +1,4 @@
-"""The steps that nuScenes and Argoverse 2 share: affine moves, crossing contours, boundary rings.
+"""Steps that nuScenes and Argoverse 2 share: affine moves, crossing contours, boundary rings.
 
 Operations and their order follow the official data converters to the last bit where it matters: a crossing whose
 edge lies on the border of the region changes shape with the rounding of its coordinates.

@@ -1,4 +1,4 @@
-"""The forms that the field gives to ground-truth polylines: simplified, resampled, normalised, permuted."""
+"""Forms of ground-truth polylines in the field: simplified, resampled, normalised, permuted."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ STRAIGHT_ON = np.cos(np.radians(20.0))
 
 
 class MapTruth(Protocol):
-    """What the ground truth of each data set offers for this."""
+    """Ground truth that can be asked for whole elements in an area."""
 
     def region(self, pose: Float, roi: RegionOfInterest) -> Polygon:
         """Return the rectangle that a frame covers, in the global frame."""
