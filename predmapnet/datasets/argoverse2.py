@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
+from mapfusion.georeference import Georeference
 from predmapnet.datasets.argoverse2_files import (
     ARGOVERSE2_CAMERAS,
     POSES,
@@ -36,7 +37,7 @@ from predmapnet.datasets.lidar import read_argoverse2_sweep
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
+from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
 
 Float = NDArray[np.float64]
 Integer = NDArray[np.int64]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
+from mapfusion.georeference import Georeference
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map_file
@@ -23,7 +24,7 @@ from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Record,
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, Frame, FrameTruth, Georeference, Instant, Progress, Rig, SceneInfo
+from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
 
 Float = NDArray[np.float64]
 
