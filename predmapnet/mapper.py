@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
@@ -25,7 +26,7 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.rig_geometry import arranged_rig
 from predmapnet.network.state import FrameInputs, Instances, RigGeometry, Selection, StreamState
 from predmapnet.network.track_selection import select
-from predmapnet.scenes import Float, Frame, Image, Rig, ground_in_view
+from predmapnet.scenes import Frame, Image, Rig, ground_in_view
 from predmapnet.weights.checkpoint import load_checkpoint
 
 RIG_TOLERANCE = 1e-4

@@ -11,11 +11,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.georeference import Georeference
 from mapfusion.ground import CameraSector, ground_within, region, rings_around, visible_ground
 
-Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Progress = Callable[[int, int, str], None]
 """Callback ``progress(done, total, what)`` of a long preparation."""

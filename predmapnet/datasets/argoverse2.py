@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.georeference import Georeference
 from predmapnet.datasets.argoverse2_files import (
@@ -38,9 +38,6 @@ from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
 from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 KEY_FRAME_STRIDE = 4
 """Every fourth lidar sweep of 10 Hz is a key frame (2.5 Hz), as in the official vector-map data sets."""

@@ -11,10 +11,9 @@ import orjson
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, feather
 
+from mapfusion.arrays import Integer
 from predmapnet.datasets.splits import SPLITS
 from predmapnet.errors import UserError
-
-Integer = NDArray[np.int64]
 
 POSES = "city_SE3_egovehicle.feather"
 ARGOVERSE2_CAMERAS = (

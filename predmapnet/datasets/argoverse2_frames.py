@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Integer = NDArray[np.int64]
+from mapfusion.arrays import Integer
 
 IMAGE_TOLERANCE = 25_000_000
 """An image belongs to a sweep if it lies within half the cameras' shutter interval, nanoseconds."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 NUSCENES_ORIGINS = {
     "boston-seaport": (42.336849169438615, -71.05785369873047),

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.datasets.argoverse2_files import read_table
 from predmapnet.errors import UserError
-
-Float = NDArray[np.float64]
 
 NUSCENES_COLUMNS = 5
 """x, y, z, intensity, ring."""

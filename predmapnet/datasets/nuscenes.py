@@ -9,8 +9,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from mapfusion.georeference import Georeference
@@ -25,8 +25,6 @@ from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
 from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
-
-Float = NDArray[np.float64]
 
 OLD_SPLIT = {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"}
 OLD_MINI_SPLIT = {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"}

@@ -6,37 +6,12 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
+from mapfusion.geometry import rotation_of_quaternion
 from predmapnet.errors import UserError
 
-Float = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
-_UNIT_TOLERANCE = 1e-14
-
-
-def rotation_matrix(quaternion: Float) -> Float:
-    """Rotation matrices of unit quaternions.
-
-    Args:
-        quaternion: ``(..., 4)``, order w, x, y, z; normalised here.
-
-    Returns:
-        ``(..., 3, 3) float64``.
-    """
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    square = w * w + x * x + y * y + z * z
-    # Order and grouping of the operations are those of the reader that the official data sets use. Their ground truth
-    # depends on the last bits of poses, so nothing here may go through a matrix product, whose bits vary by machine.
-    length = np.where(np.abs(1.0 - square) < _UNIT_TOLERANCE, 1.0, np.sqrt(square))
-    w, x, y, z = w / length, x / length, y / length, z / length
-    left = ((x, w, -z, y), (y, z, w, -x), (z, -y, x, w))
-    right = ((x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
-    rows = [
-        [row[0] * column[0] + row[1] * column[1] + row[2] * column[2] + row[3] * column[3] for column in right]
-        for row in left
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def quaternion_of(rotation: Float) -> Float:
@@ -93,6 +68,6 @@ def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], wh
             f"{norm:.6g} (must be 1), translation {offset.tolist()} m (must be finite). Repair or remove this frame."
         )
     pose = np.eye(4)
-    pose[:3, :3] = rotation_matrix(quaternion)
+    pose[:3, :3] = rotation_of_quaternion(quaternion)
     pose[:3, 3] = offset
     return pose

@@ -8,8 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
+from mapfusion.arrays import Float, Integer
 
 POINTS_PER_LINE = 200
 """Points at equal distances along a line between which the official distance is measured."""

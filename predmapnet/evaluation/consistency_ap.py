@@ -13,6 +13,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Integer
 from mapfusion.elements import ElementKind
 from predmapnet.evaluation.chamfer_ap import STANDARD_THRESHOLDS, Thresholds, chamfer_from_flags
 from predmapnet.evaluation.chamfer_distance import (
@@ -25,8 +26,6 @@ from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.precision_recall import AveragePrecision
 from predmapnet.evaluation.tracks import form_tracks, truth_track_ids
 
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 Flags = NDArray[np.int8]
 
 _TRUTH_POINTS = 20

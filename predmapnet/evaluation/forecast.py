@@ -13,15 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import clip_line, inverse_pose, resample, transform_points
 from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 HORIZONS = (1, 2)
 """Instants ahead."""

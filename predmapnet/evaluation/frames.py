@@ -7,15 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, FrameMap
 from predmapnet.datasets.ground_truth.vectors import SIMPLIFICATION
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -15,14 +15,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
 from mapfusion.geometry import chamfer_distance, transform_points
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_distance import match_greedily
 from predmapnet.evaluation.precision_recall import AveragePrecision, accumulate
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 THRESHOLDS = (0.5, 1.0, 1.5)
 """Metres."""

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Integer
 from predmapnet.evaluation.frames import EvaluationFrame
-
-Integer = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

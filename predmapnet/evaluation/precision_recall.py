@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind
-
-Float = NDArray[np.float64]
 
 _EPSILON = float(np.finfo(np.float32).eps)
 

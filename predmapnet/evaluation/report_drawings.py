@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.evaluation.precision_recall import PrecisionRecallCurve
-
-Float = NDArray[np.float64]
 
 COLOURS = {ElementKind.PED_CROSSING: "#2f6fde", ElementKind.DIVIDER: "#e07b1f", ElementKind.BOUNDARY: "#2e9e4f"}
 _SHADES = ("#9fb3c8", "#486581", "#102a43")

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.ground_truth.raster import Mask, instance_masks
 from predmapnet.datasets.ground_truth.tracks import (
@@ -24,9 +24,6 @@ from predmapnet.datasets.ground_truth.tracks import (
 )
 from predmapnet.evaluation.chamfer_distance import resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 POINTS_PER_LINE = 20
 PREDICTION_OVERLAP = 0.001

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind
 from predmapnet.errors import UserError
 from predmapnet.frame_files.submission import SubmittedFrame, is_maptr, load_results, submitted_frames
-
-Float = NDArray[np.float64]
 
 
 def read_detections(path: Path) -> dict[str, SubmittedFrame]:

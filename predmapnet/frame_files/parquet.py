@@ -25,23 +25,20 @@ Files without the column ``visible`` are read, too. Rasters (segmentation, histo
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
 from predmapnet.files import write_file
-
-Float = NDArray[np.float64]
 
 SCHEMA_VERSION = 1
 _VERSION_KEY = b"predmapnet_frames"
@@ -90,96 +87,47 @@ class StoredFrames:
     frames: tuple[StoredFrame, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """Names of the scenes in the file, in order of appearance."""
-        return tuple(dict.fromkeys(frame.scene for frame in self.frames))
 
-
-class FrameWriter:
-    """Writer of frames as they come; the file appears under its name only if all goes well.
-
-    Use it as a context manager. An exception inside leaves no file.
-
-    Args:
-        path: the Parquet file; its folder exists.
-        provenance: anything that JSON can hold: version, configuration, weights, data set.
-    """
-
-    def __init__(self, path: Path, provenance: Mapping[str, Any]) -> None:
-        metadata = {_VERSION_KEY: str(SCHEMA_VERSION), _PROVENANCE_KEY: json.dumps(dict(provenance), sort_keys=True)}
-        self._schema = _SCHEMA.with_metadata(metadata)
-        self._path = path
-        self._rows: list[dict[str, Any]] = []
-        self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
-        temporary = self._stack.enter_context(write_file(self._path))
-        self._writer = self._stack.enter_context(pq.ParquetWriter(temporary, self._schema, compression="zstd"))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            try:
-                self._flush()
-            except BaseException as failure:
-                self._stack.__exit__(type(failure), failure, failure.__traceback__)
-                raise
-        self._stack.__exit__(kind, error, trace)
-
-    def write(self, scene: str, index: int, frame_map: FrameMap, token: str = "") -> None:
-        """Append one frame."""
-        forecasts, visible = frame_map.forecasts, frame_map.visible
-        self._rows.append(
-            {
-                "scene": scene,
-                "index": index,
-                "token": token,
-                "timestamp": frame_map.timestamp,
-                "ego_to_global": frame_map.ego_to_global.ravel().tolist(),
-                "roi_length": frame_map.roi.length,
-                "roi_width": frame_map.roi.width,
-                "kinds": frame_map.kinds.tolist(),
-                "scores": frame_map.scores.tolist(),
-                "track_ids": frame_map.track_ids.tolist(),
-                "polylines": [points.ravel().tolist() for points in frame_map.polylines],
-                "forecasts": None if forecasts is None else [points.ravel().tolist() for points in forecasts],
-                "visible": None if visible is None else [points.ravel().tolist() for points in visible],
-            }
-        )
-        if len(self._rows) >= _ROWS_PER_GROUP:
-            self._flush()
-
-    def _flush(self) -> None:
-        if self._rows:
-            self._writer.write_table(pa.Table.from_pylist(self._rows, schema=self._schema))
-            self._rows.clear()
-
-
-def write_frames(
-    path: Path,
-    scene: str,
-    frame_maps: Sequence[FrameMap],
-    provenance: Mapping[str, Any],
-    tokens: Sequence[str] | None = None,
-) -> None:
-    """Write all frames of one scene to a Parquet file, whole or not at all.
+def write_frames(path: Path, frames: Iterable[StoredFrame], provenance: Mapping[str, Any]) -> None:
+    """Write frames to a Parquet file, whole or not at all.
 
     Args:
         path: the file; its folder exists.
-        scene: name of the scene.
-        frame_maps: frames 0, 1, ... of the scene.
-        provenance: anything that JSON can hold.
-        tokens: the data set's own names of the frames, if it has any.
+        frames: in the order of the file; they may come from a generator, and only a few are held at a time.
+        provenance: anything that JSON can hold: version, configuration, weights, data set.
 
     Raises:
         UserError: the file cannot be written.
     """
-    with FrameWriter(path, provenance) as writer:
-        for index, frame_map in enumerate(frame_maps):
-            writer.write(scene, index, frame_map, tokens[index] if tokens else "")
+    metadata = {_VERSION_KEY: str(SCHEMA_VERSION), _PROVENANCE_KEY: json.dumps(dict(provenance), sort_keys=True)}
+    schema = _SCHEMA.with_metadata(metadata)
+    rows = map(_row_of, frames)
+    with write_file(path) as temporary, pq.ParquetWriter(temporary, schema, compression="zstd") as writer:
+        while group := list(islice(rows, _ROWS_PER_GROUP)):
+            writer.write_table(pa.Table.from_pylist(group, schema=schema))
+
+
+def _row_of(frame: StoredFrame) -> dict[str, Any]:
+    frame_map = frame.frame_map
+    return {
+        "scene": frame.scene,
+        "index": frame.index,
+        "token": frame.token,
+        "timestamp": frame_map.timestamp,
+        "ego_to_global": frame_map.ego_to_global.ravel().tolist(),
+        "roi_length": frame_map.roi.length,
+        "roi_width": frame_map.roi.width,
+        "kinds": frame_map.kinds.tolist(),
+        "scores": frame_map.scores.tolist(),
+        "track_ids": frame_map.track_ids.tolist(),
+        "polylines": _flat(frame_map.polylines),
+        "forecasts": _flat(frame_map.forecasts),
+        "visible": _flat(frame_map.visible),
+    }
+
+
+def _flat(lines: Sequence[Float] | None) -> list[list[float]] | None:
+    return None if lines is None else [points.ravel().tolist() for points in lines]
 
 
 def stored_scenes(path: Path) -> tuple[str, ...]:

@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import orjson
-from numpy.typing import NDArray
 
-from mapfusion.integrate.observations import pose_problem
+from mapfusion.arrays import Float
+from mapfusion.geometry import rigid_pose_problem
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.errors import UserError
 from predmapnet.scenes import Instant
-
-Float = NDArray[np.float64]
 
 HOW = (
     "Each pose needs a token, a timestamp (integer nanoseconds) and either ego_to_global (4 x 4), or translation "
@@ -108,7 +106,7 @@ def _pose(where: str, row: Mapping[str, Any]) -> FramePose:
         raise UserError(f"{where}: {error} is missing. {HOW}.") from error
     except (TypeError, ValueError) as error:
         raise UserError(f"{where}: {error}. {HOW}.") from error
-    problem = pose_problem(matrix)
+    problem = rigid_pose_problem(matrix)
     if problem is not None:
         raise UserError(f"{where}: {problem}; its rotation is {np.round(matrix[:3, :3], 3).tolist()}.")
     return FramePose(str(row["token"]), timestamp, matrix, str(row.get("scene", row.get("log", ""))))

@@ -25,13 +25,11 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
 from predmapnet.frame_files.parquet import refuse_pickle
 from predmapnet.scenes import Instant
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 _ENOUGH_TO_JUDGE = 10
 """Number of elements from which on a file whose points all lie in [0, 1] is taken to be normalised."""

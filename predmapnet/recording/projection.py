@@ -6,11 +6,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
 from predmapnet.scenes import Camera
-
-Float = NDArray[np.float64]
 
 NEAR_METRES = 1.0
 """Points nearer to the camera plane than this are cut off: their projection runs away."""

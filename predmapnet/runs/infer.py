@@ -22,7 +22,7 @@ from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
-from predmapnet.frame_files.parquet import write_frames
+from predmapnet.frame_files.parquet import StoredFrame, write_frames
 from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.mapping import MapSnapshot, Observer, SceneRun, Step, map_scene
@@ -190,8 +190,9 @@ class MappingPipeline:
                 observed = observed_rings(run.observed, georeference)
                 write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
             if outputs.frames is not None:
-                tokens = [frame.token for frame in run.frames]
-                write_frames(outputs.frames, scene_name, run.frame_maps, provenance, tokens)
+                pairs = zip(run.frames, run.frame_maps, strict=True)
+                stored = (StoredFrame(frame.scene, frame.index, frame.token, mapped) for frame, mapped in pairs)
+                write_frames(outputs.frames, stored, provenance)
         accuracy = measure(scene, run, self.mapper.roi)
         return MappedScene(run, _report(scene, run, accuracy, preparing_seconds, outputs))
 

@@ -8,9 +8,13 @@ import pytest
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.frame_files.parquet import write_frames
+from predmapnet.frame_files.parquet import StoredFrame, write_frames
 
 ROI = RegionOfInterest()
+
+
+def stored(maps, scene):
+    return [StoredFrame(scene, index, "", frame_map) for index, frame_map in enumerate(maps)]
 
 
 def truth_as_results(root, name):
@@ -49,7 +53,7 @@ def test_two_processes_measure_the_same(predmapnet, tiny_root, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("scene-0001", "scene-0002"):
-        write_frames(folder / f"{name}.parquet", name, truth_as_results(tiny_root, name)[1], {})
+        write_frames(folder / f"{name}.parquet", stored(truth_as_results(tiny_root, name)[1], name), {})
     arguments = ["evaluate", folder, "--data-root", tiny_root]
     assert predmapnet(*arguments, "--json", tmp_path / "one.json").code == 0
     assert predmapnet(*arguments, "--json", tmp_path / "two.json", "--jobs", 2).code == 0
@@ -58,7 +62,7 @@ def test_two_processes_measure_the_same(predmapnet, tiny_root, tmp_path):
 
 def test_the_truth_as_results_is_perfect_in_parquet_and_as_a_submission(predmapnet, tiny_root, tmp_path):
     scene, maps = truth_as_results(tiny_root, "scene-0001")
-    write_frames(tmp_path / "frames.parquet", "scene-0001", maps, {})
+    write_frames(tmp_path / "frames.parquet", stored(maps, "scene-0001"), {})
     entries = {
         scene.frame(index).token: {
             "vectors": [line.tolist() for line in frame_map.polylines],
@@ -89,7 +93,7 @@ def test_the_new_split_measures_other_scenes(predmapnet, tiny_root, tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     for name in ("scene-0001", "scene-0002"):
-        write_frames(folder / f"{name}.parquet", name, truth_as_results(tiny_root, name)[1], {})
+        write_frames(folder / f"{name}.parquet", stored(truth_as_results(tiny_root, name)[1], name), {})
     measured = {}
     for scheme in ("old", "new"):
         arguments = [
@@ -112,7 +116,7 @@ def test_the_new_split_measures_other_scenes(predmapnet, tiny_root, tmp_path):
 
 
 def test_truth_is_kept_and_used_again(predmapnet, tiny_root, tmp_path):
-    write_frames(tmp_path / "frames.parquet", "scene-0001", truth_as_results(tiny_root, "scene-0001")[1], {})
+    write_frames(tmp_path / "frames.parquet", stored(truth_as_results(tiny_root, "scene-0001")[1], "scene-0001"), {})
     arguments = ["evaluate", tmp_path / "frames.parquet", "--data-root", tiny_root, "--json"]
     assert predmapnet(*arguments, tmp_path / "none.json", "--no-truth-cache").code == 0
     assert not (tmp_path / "cache").exists()
@@ -148,7 +152,7 @@ def test_what_cannot_be_measured_is_said_in_one_message(predmapnet, tiny_root, t
     empty = tmp_path / "empty"
     empty.mkdir()
     _, maps = truth_as_results(tiny_root, "scene-0001")
-    write_frames(tmp_path / "other.parquet", "scene-9999", maps, {})
+    write_frames(tmp_path / "other.parquet", stored(maps, "scene-9999"), {})
     for results, message in (
         (pickled, "pickle"),
         (empty, "--save-frames"),

@@ -9,7 +9,7 @@ from mapfusion import ElementKind
 from mapfusion.formats.by_suffix import read_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.ground import coverage
-from predmapnet.frame_files.parquet import FrameWriter
+from predmapnet.frame_files.parquet import StoredFrame, write_frames
 from tests.mapfusion.simulation import town_drive
 
 ORIGIN = "49.0,8.4"
@@ -66,9 +66,8 @@ def write(path, content):
 @pytest.fixture
 def reference(predmapnet, tmp_path, drive):
     """The map of the same frames from our own Parquet, which the others must equal."""
-    with FrameWriter(tmp_path / "frames.parquet", {"location": "somewhere"}) as writer:
-        for i, frame in enumerate(drive.frames):
-            writer.write("log-1", i, frame)
+    stored = [StoredFrame("log-1", i, "", frame) for i, frame in enumerate(drive.frames)]
+    write_frames(tmp_path / "frames.parquet", stored, {"location": "somewhere"})
     result = predmapnet("integrate", "frames.parquet", "--origin", ORIGIN, "--out", "reference.geojson")
     assert result.code == 0, result.err
     found = read_map(tmp_path / "reference.geojson", PLANE)
@@ -170,9 +169,8 @@ def test_points_that_are_not_finite_are_counted(predmapnet, tmp_path, drive):
 
 def test_frames_of_a_demo_town_know_their_place_and_what_was_observed(predmapnet, tmp_path, drive):
     told = {"location": "town-0007", "synthetic": True}
-    with FrameWriter(tmp_path / "frames.parquet", told) as writer:
-        for i, frame in enumerate(drive.frames):
-            writer.write("scene-0007", i, frame)
+    stored = [StoredFrame("scene-0007", i, "", frame) for i, frame in enumerate(drive.frames)]
+    write_frames(tmp_path / "frames.parquet", stored, told)
     result = predmapnet("integrate", "frames.parquet", "--out", "map.geojson")
     assert result.code == 0, result.err
     found = json.loads((tmp_path / "map.geojson").read_text())
@@ -185,8 +183,7 @@ def test_frames_of_a_demo_town_know_their_place_and_what_was_observed(predmapnet
     elsewhere = coverage(read_map(tmp_path / "there.gpkg", PLANE), PLANE)
     assert spoken.area == pytest.approx(elsewhere.area, rel=0.02)
     assert spoken.area == pytest.approx(12 * 4.5 * 26.0 + 56.0 * 26.0 - 4.5 * 26.0, rel=0.1)
-    with FrameWriter(tmp_path / "frames.parquet", told | {"location": "boston-seaport"}) as writer:
-        writer.write("scene-0007", 0, drive.frames[0])
+    write_frames(tmp_path / "frames.parquet", stored[:1], told | {"location": "boston-seaport"})
     lost = predmapnet("integrate", "frames.parquet", "--out", "map.geojson")
     assert lost.code == 2
     assert "--origin" in lost.err

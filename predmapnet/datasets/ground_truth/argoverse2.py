@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA
@@ -42,8 +43,6 @@ from predmapnet.datasets.ground_truth.patch import (
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
 
 TILT_MARGIN = 5.0
 """Crossings are moved to the ego frame with roll and pitch; those this far outside the patch cannot come in."""

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
@@ -20,15 +18,14 @@ from typing import Protocol
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from mapfusion import geometry
+from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
+from mapfusion.files import write_whole
 from predmapnet.datasets import poses as poses_module
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
 
 
 @cache
@@ -124,14 +121,8 @@ def _save(path: Path, truths: Sequence[FrameTruth]) -> None:
         "kinds": np.concatenate([np.zeros(0, dtype=np.int64), *(truth.kinds for truth in truths)]),
         "element_ids": np.concatenate([np.zeros(0, dtype=np.int64), *(truth.element_ids for truth in truths)]),
     }
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=".truth-", suffix=".npz")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with write_whole(path) as temporary:
+        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
 
 
 def _load(path: Path) -> list[FrameTruth]:

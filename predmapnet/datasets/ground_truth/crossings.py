@@ -9,9 +9,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.datasets.ground_truth.patch import parts_of_type
-
-Float = NDArray[np.float64]
 
 PARALLEL = 0.01
 """Two long sides are parallel if one minus their cosine is below this (8.1 degrees)."""

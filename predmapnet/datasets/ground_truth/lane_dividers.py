@@ -15,7 +15,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import LineString
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
+
 Vertex3D = tuple[float, float, float]
 
 SAME = 0.9

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
+from mapfusion.geometry import rotation_of_quaternion
 from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA, merge_crossings
 from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.datasets.ground_truth.patch import (
@@ -30,11 +31,10 @@ from predmapnet.datasets.ground_truth.patch import (
     restored_corners,
     rotation_about,
 )
-from predmapnet.datasets.poses import quaternion_of, rotation_matrix
+from predmapnet.datasets.poses import quaternion_of
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
 
-Float = NDArray[np.float64]
 Records = list[dict[str, Any]]
 
 
@@ -135,7 +135,7 @@ class NuScenesGroundTruth:
         """
         centre = (float(lidar_to_global[0, 3]), float(lidar_to_global[1, 3]))
         # The official code hands the pose on as a quaternion; its last bits decide about corners of crossings.
-        rotation = rotation_matrix(quaternion_of(lidar_to_global[:3, :3]))
+        rotation = rotation_of_quaternion(quaternion_of(lidar_to_global[:3, :3]))
         angle = math.atan2(rotation[1, 0], rotation[0, 0]) / math.pi * 180
         patch = patch_polygon(centre, roi.width, roi.length, angle)
         place = _Place(centre, rotation_about(-angle, centre))

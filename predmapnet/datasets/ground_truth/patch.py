@@ -15,7 +15,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
+
 Geometries = NDArray[Any]
 
 BORDER = 0.2

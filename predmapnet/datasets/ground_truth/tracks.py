@@ -6,17 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.ground_truth.raster import Mask, instance_masks, mask_iou
 from predmapnet.datasets.ground_truth.vectors import normalised, resampled
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
-Integer = NDArray[np.int64]
 
 MINIMUM_IOU = 0.01
 """Masks must overlap by more than this for the same element in two frames."""

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import resample
 from predmapnet.datasets.ground_truth.patch import CLOSED_TOLERANCE, is_closed
-
-Float = NDArray[np.float64]
 
 POINTS = 20
 SIMPLIFICATION = 0.2

@@ -7,13 +7,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely import LineString, Polygon
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement, RegionOfInterest
-
-Float = NDArray[np.float64]
 
 SAME_LINE = 0.1
 """A divider within this distance of a longer one, metres, is the same line digitised twice."""

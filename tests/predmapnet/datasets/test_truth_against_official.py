@@ -12,11 +12,11 @@ import shapely
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
-from predmapnet.datasets.ground_truth.raster import semantic_mask
 from predmapnet.datasets.ground_truth.vectors import normalised, permuted, resampled, simplified
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of
 from predmapnet.datasets.splits import split_names
+from tests.predmapnet.datasets.semantic_mask import semantic_mask
 
 pytestmark = pytest.mark.reference
 

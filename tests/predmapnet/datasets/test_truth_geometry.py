@@ -8,12 +8,13 @@ from hypothesis import strategies as st
 from shapely import LineString, Polygon
 
 from mapfusion.elements import ElementKind, RegionOfInterest
+from mapfusion.geometry import rotation_of_quaternion
 from predmapnet.datasets.ground_truth.crossings import merge_crossings
 from predmapnet.datasets.ground_truth.lane_dividers import LaneSide, chain_dividers, connected, relinked
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.vectors import normalised, permuted
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines, truth_map
-from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of, rotation_matrix
+from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of
 from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 from predmapnet.errors import UserError
@@ -226,7 +227,7 @@ def test_permutations_of_a_ring_start_everywhere_and_run_both_ways():
 @properties
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
 def test_rotation_matrices_are_rotations(quaternion):
-    rotation = rotation_matrix(np.array(quaternion))
+    rotation = rotation_of_quaternion(np.array(quaternion))
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     back = quaternion_of(rotation)

@@ -10,7 +10,7 @@ import pytest
 
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.errors import UserError
-from predmapnet.frame_files.parquet import FrameWriter, read_frames, stored_scenes, write_frames
+from predmapnet.frame_files.parquet import StoredFrame, read_frames, stored_scenes, write_frames
 from predmapnet.frame_files.submission import read_submission
 
 
@@ -31,16 +31,20 @@ def frame_map(count, generator, forecasts=True):
     )
 
 
+def stored(maps, scene="s"):
+    return [StoredFrame(scene, index, "", found) for index, found in enumerate(maps)]
+
+
 def test_frames_come_back_bit_by_bit(tmp_path):
     generator = np.random.default_rng(1)
     maps = [frame_map(count, generator, forecasts=count != 3) for count in [5, 0, 3, *[2] * 100]]
     path = tmp_path / "frames.parquet"
-    write_frames(path, "scene-0103", maps, {"version": "0.1.0", "dataset": "demo"})
-    stored = read_frames(path)
-    assert stored.provenance == {"version": "0.1.0", "dataset": "demo"}
-    assert stored.scenes == ("scene-0103",)
-    assert [frame.index for frame in stored.frames] == list(range(len(maps)))
-    for read, written in zip(stored.frames, maps, strict=True):
+    write_frames(path, stored(maps, "scene-0103"), {"version": "0.1.0", "dataset": "demo"})
+    back = read_frames(path)
+    assert back.provenance == {"version": "0.1.0", "dataset": "demo"}
+    assert stored_scenes(path) == ("scene-0103",)
+    assert [frame.index for frame in back.frames] == list(range(len(maps)))
+    for read, written in zip(back.frames, maps, strict=True):
         got = read.frame_map
         assert (got.timestamp, got.roi) == (written.timestamp, written.roi)
         for name in ("ego_to_global", "kinds", "scores", "track_ids"):
@@ -58,7 +62,7 @@ def test_frames_come_back_bit_by_bit(tmp_path):
 
 def test_a_file_that_does_not_say_what_was_visible_is_read(tmp_path):
     path = tmp_path / "frames.parquet"
-    write_frames(path, "scene-0103", [frame_map(2, np.random.default_rng(1))], {})
+    write_frames(path, stored([frame_map(2, np.random.default_rng(1))], "scene-0103"), {})
     pq.write_table(pq.read_table(path).drop_columns(["visible"]), path)
     assert read_frames(path).frames[0].frame_map.visible is None
 
@@ -66,25 +70,27 @@ def test_a_file_that_does_not_say_what_was_visible_is_read(tmp_path):
 def test_one_scene_of_many_is_read_alone(tmp_path):
     path = tmp_path / "frames.parquet"
     generator = np.random.default_rng(3)
-    with FrameWriter(path, {}) as writer:
-        for scene in ("b", "a"):
-            for index in range(2):
-                writer.write(scene, index, frame_map(2, generator), token=f"{scene}{index}")
+    frames = [StoredFrame(s, i, f"{s}{i}", frame_map(2, generator)) for s in ("b", "a") for i in range(2)]
+    write_frames(path, frames, {})
     assert stored_scenes(path) == ("b", "a")
     assert [frame.token for frame in read_frames(path, "a").frames] == ["a0", "a1"]
 
 
 def test_the_same_frames_give_the_same_bytes(tmp_path):
     for name in ("a", "b"):
-        write_frames(tmp_path / name, "s", [frame_map(4, np.random.default_rng(0))], {"b": 1, "a": 2})
+        write_frames(tmp_path / name, stored([frame_map(4, np.random.default_rng(0))], "s"), {"b": 1, "a": 2})
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_an_interrupted_run_leaves_no_file(tmp_path):
     path = tmp_path / "frames.parquet"
-    with pytest.raises(KeyboardInterrupt), FrameWriter(path, {}) as writer:
-        writer.write("s", 0, frame_map(2, np.random.default_rng(0)))
+
+    def interrupted():
+        yield from stored([frame_map(2, np.random.default_rng(0))])
         raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_frames(path, interrupted(), {})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -94,7 +100,7 @@ def test_what_cannot_be_read_is_refused(tmp_path):
     other = tmp_path / "other.parquet"
     pq.write_table(pa.table({"a": [1]}), other)
     whole = tmp_path / "whole.parquet"
-    write_frames(whole, "s", [frame_map(4, np.random.default_rng(0))], {})
+    write_frames(whole, stored([frame_map(4, np.random.default_rng(0))], "s"), {})
     cut = tmp_path / "cut.parquet"
     cut.write_bytes(whole.read_bytes()[:-200])
     for path, message in [
