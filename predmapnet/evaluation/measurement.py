@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mapfusion.elements import GlobalMap
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
-from predmapnet.evaluation.consistency_ap import consistency_flags, matched_tracks, with_formed_tracks
+from predmapnet.evaluation.consistency_ap import Flags, consistency_flags, matched_tracks, with_formed_tracks
 from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import GlobalMapQuality, global_map_quality, pool, seen_area
@@ -25,8 +22,6 @@ from predmapnet.evaluation.raster_ap import (
     raster_matches,
 )
 from predmapnet.evaluation.tracks import truth_track_ids
-
-Flags = NDArray[np.int8]
 
 
 @dataclass(frozen=True)

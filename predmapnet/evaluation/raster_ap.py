@@ -14,14 +14,12 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.ground_truth.raster import mask_iou
+from predmapnet.datasets.ground_truth.raster import Mask, mask_iou
 from predmapnet.evaluation.frames import EvaluationFrame
 
-Mask = NDArray[np.uint8]
 Axes = Literal["mapvr", "ego"]
 """Axes of the canvas: ``mapvr`` has x to the right and y forward, as MapVR draws it; ``ego`` x forward.
 Rounding makes a difference in the third digit."""

@@ -17,9 +17,10 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from predmapnet.config import ImageConfig, ImageWindowConfig, WholeImageConfig
-from predmapnet.scenes import Camera, Float, Image, Rig
+from predmapnet.scenes import Camera, Image, Rig
 
 Window = NDArray[np.uint8] | NDArray[np.float32]
 """Pixels 0 to 255. Windows are rounded; whole images are not, since MapTracker stretches floating-point images."""

@@ -12,11 +12,12 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mapfusion.arrays import Float
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import input_size, window_intrinsics
 from predmapnet.network.layers import cell_centres
 from predmapnet.network.small.backbone import STRIDE
-from predmapnet.scenes import Float, Rig
+from predmapnet.scenes import Rig
 
 Integer = NDArray[np.int64]
 
