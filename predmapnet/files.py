@@ -24,19 +24,20 @@ def check_output(path: Path) -> None:
         raise UserError(f"cannot write {path.name}: the folder {folder} does not exist; create it or choose another")
     if not folder.is_dir():
         raise UserError(f"cannot write {path.name}: {folder} is a file, not a folder")
-    with _told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
+    with write_errors_told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
         trial.write(b" ")
 
 
 @contextlib.contextmanager
 def write_file(path: Path) -> Iterator[Path]:
     """Write ``path`` as :func:`mapfusion.files.write_whole` does, but raise UserError if that fails."""
-    with _told(path), mapfusion.files.write_whole(path) as temporary:
+    with write_errors_told(path), mapfusion.files.write_whole(path) as temporary:
         yield temporary
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
+def write_errors_told(path: Path) -> Iterator[None]:
+    """Raise OSErrors of the block as UserErrors that name ``path``."""
     try:
         yield
     except OSError as error:

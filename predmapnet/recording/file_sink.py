@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import os
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import rerun as rr
 
-from predmapnet.files import write_file
+from mapfusion.files import write_whole
+from predmapnet.files import write_errors_told
 
 
 class RecordingFile:
@@ -28,7 +29,7 @@ class RecordingFile:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        temporary = self._stack.enter_context(write_file(self._path))
+        temporary = self._stack.enter_context(write_whole(self._path))
         source, target = os.pipe()
         self._pump = threading.Thread(target=self._carry, args=(source, temporary), daemon=True)
         self._pump.start()
@@ -52,8 +53,7 @@ class RecordingFile:
     ) -> None:
         self._recording.disconnect()
         self._pump.join()
-        with self._stack:
-            if kind is None and self._error is not None:
-                raise self._error
-            if error is not None:
-                raise error
+        failure = error or self._error
+        with nullcontext() if error is not None else write_errors_told(self._path), self._stack:
+            if failure is not None:
+                raise failure
