@@ -10,8 +10,8 @@ import typer
 
 def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics.jsonl and the weights.")],
-    preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file.")] = "lite",
-    data: Annotated[str, typer.Option(help="Data to train on: demo.")] = "demo",
+    preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file of one.")] = "lite",
+    data: Annotated[str, typer.Option(help="Training data: demo.")] = "demo",
     stage: Annotated[
         str, typer.Option(help="all, or one of: single, temporal (lite); bev, warmup, joint (paper, maptracker).")
     ] = "all",
@@ -27,16 +27,16 @@ def train(
     threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
     learning_rate: Annotated[
         float | None,
-        typer.Option(min=1e-6, help="Peak (lite: of stage single, 1e-3; others: 5e-4); less to go on from good ones."),
+        typer.Option(min=1e-6, help="Peak learning rate. Default: 1e-3 in lite's stage single, else 5e-4."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of weights and draws.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
     init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of the training cache.", show_default=False)] = None,
 ) -> None:
-    """Train the network; survives being killed, and goes on with --resume.
+    """Train the network; after an interruption, --resume continues.
 
-    One process per core with one thread each is fastest on a CPU that others use too.
+    On a shared CPU, one process per core with one thread each is fastest.
     """
     import os
 

@@ -10,9 +10,11 @@ import shapely
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, FrameMap
-from predmapnet.datasets.ground_truth.vectors import SIMPLIFICATION
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
+
+SIMPLIFICATION = 0.2
+"""Tolerance of the ground truth in the official evaluation, metres."""
 
 
 @dataclass(frozen=True)

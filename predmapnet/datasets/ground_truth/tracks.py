@@ -10,11 +10,13 @@ from scipy.optimize import linear_sum_assignment
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
-from mapfusion.geometry import inverse_pose
+from mapfusion.geometry import inverse_pose, resample
 from predmapnet.datasets.ground_truth.raster import Mask, instance_masks, mask_iou
-from predmapnet.datasets.ground_truth.vectors import normalised, resampled
 from predmapnet.scenes import FrameTruth
 
+POINTS = 20
+"""Points per element, as in the official training."""
+NORMALISATION_EPSILON = 1e-5
 MINIMUM_IOU = 0.01
 """Masks must overlap by more than this for the same element in two frames."""
 
@@ -36,8 +38,8 @@ class TrackFrame:
 
 def track_frame(truth: FrameTruth, ego_to_global: Float, roi: RegionOfInterest) -> TrackFrame:
     """Bring a frame's truth to the form that is tracked: 20 points per element, normalised."""
-    points = [normalised(resampled(line), roi) for line in truth.polylines]
-    return TrackFrame(truth.kinds, np.array(points).reshape(-1, 20, 2), ego_to_global)
+    points = [normalised(resample(line, POINTS), roi) for line in truth.polylines]
+    return TrackFrame(truth.kinds, np.array(points).reshape(-1, POINTS, 2), ego_to_global)
 
 
 def official_track_ids(frames: Sequence[TrackFrame], roi: RegionOfInterest) -> list[Integer]:
@@ -71,6 +73,19 @@ def official_track_ids(frames: Sequence[TrackFrame], roi: RegionOfInterest) -> l
             next_id += len(fresh)
             ids[index][rows] = current
     return ids
+
+
+def normalised(points: Float, roi: RegionOfInterest) -> Float:
+    """Coordinates over the region: 0 at its lower left corner, just under 1 at the opposite one.
+
+    Args:
+        points: ``(..., 2)``, metres, ego frame.
+        roi: the region.
+
+    Returns:
+        ``(..., 2) float64``; may leave [0, 1] by rounding.
+    """
+    return (points + roi.size / 2) / (roi.size + NORMALISATION_EPSILON)
 
 
 def from_normalised(points: Float, roi: RegionOfInterest) -> Float:

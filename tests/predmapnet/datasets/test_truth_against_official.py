@@ -10,12 +10,14 @@ import pytest
 import shapely
 
 from mapfusion.elements import ElementKind, RegionOfInterest
+from mapfusion.geometry import resample
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
-from predmapnet.datasets.ground_truth.vectors import normalised, permuted, resampled, simplified
+from predmapnet.datasets.ground_truth.tracks import POINTS, normalised
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of
 from predmapnet.datasets.splits import split_names
+from tests.predmapnet.datasets.official_forms import permuted, simplified
 from tests.predmapnet.datasets.semantic_mask import semantic_mask
 
 pytestmark = pytest.mark.reference
@@ -152,7 +154,7 @@ def test_simplified_and_resampled_forms_of_the_official_lines(cases):
                 ):
                     assert shape_difference(simplified(raw), short) < TOLERANCE
                     assert len(simplified(raw)) == len(short)
-                    np.testing.assert_allclose(resampled(raw), even, atol=TOLERANCE)
+                    np.testing.assert_allclose(resample(raw, POINTS), even, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("data", CASES)
@@ -166,7 +168,7 @@ def test_permutations_of_the_official_lines(reference, data):
             for key in stored.files:
                 index, kind = (int(part) for part in key.removeprefix("frame").split("_class"))
                 lines = official_lines(case["frames"][index], kind)
-                mine = [permuted(normalised(resampled(line), roi)) for line in lines]
+                mine = [permuted(normalised(resample(line, POINTS), roi)) for line in lines]
                 np.testing.assert_allclose(np.array(mine).reshape(stored[key].shape), stored[key], atol=1e-9)
                 compared += len(lines)
     assert compared > 0

@@ -12,12 +12,13 @@ from mapfusion.geometry import rotation_of_quaternion
 from predmapnet.datasets.ground_truth.crossings import merge_crossings
 from predmapnet.datasets.ground_truth.lane_dividers import LaneSide, chain_dividers, connected, relinked
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
-from predmapnet.datasets.ground_truth.vectors import normalised, permuted
+from predmapnet.datasets.ground_truth.tracks import normalised
 from predmapnet.datasets.ground_truth.whole_map import drop_repeated_lines, join_lines, truth_map
 from predmapnet.datasets.poses import combined, pose_matrix, quaternion_of
 from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 from predmapnet.errors import UserError
+from tests.predmapnet.datasets.official_forms import permuted
 
 ROI = RegionOfInterest()
 properties = settings(max_examples=20, deadline=None, derandomize=True)

@@ -1,4 +1,4 @@
-"""Forms of ground-truth polylines in the field: simplified, resampled, normalised, permuted."""
+"""Forms of ground-truth polylines in the official files that nothing in the package needs line by line."""
 
 from __future__ import annotations
 
@@ -6,14 +6,9 @@ import numpy as np
 import shapely
 
 from mapfusion.arrays import Float
-from mapfusion.elements import RegionOfInterest
-from mapfusion.geometry import resample
 from predmapnet.datasets.ground_truth.patch import CLOSED_TOLERANCE, is_closed
+from predmapnet.evaluation.frames import SIMPLIFICATION
 
-POINTS = 20
-SIMPLIFICATION = 0.2
-"""Tolerance of evaluation polylines, metres."""
-NORMALISATION_EPSILON = 1e-5
 PADDING = 1e5
 """Fills the rows of an open line's permutations that do not exist; never the nearest."""
 
@@ -28,32 +23,6 @@ def simplified(points: Float) -> Float:
         ``(k, 2) float64``.
     """
     return np.asarray(shapely.get_coordinates(shapely.simplify(shapely.LineString(points), SIMPLIFICATION)))
-
-
-def resampled(points: Float, count: int = POINTS) -> Float:
-    """Training form: ``count`` points at equal distances, both ends included.
-
-    Args:
-        points: ``(n, 2)``, metres.
-        count: number of points.
-
-    Returns:
-        ``(count, 2) float64``; a ring keeps first equal to last.
-    """
-    return resample(points, count)
-
-
-def normalised(points: Float, roi: RegionOfInterest) -> Float:
-    """Coordinates over the region: 0 at its lower left corner, just under 1 at the opposite one.
-
-    Args:
-        points: ``(..., 2)``, metres, ego frame.
-        roi: the region.
-
-    Returns:
-        ``(..., 2) float64``; may leave [0, 1] by rounding.
-    """
-    return (points + roi.size / 2) / (roi.size + NORMALISATION_EPSILON)
 
 
 def permuted(points: Float) -> Float:
