@@ -44,16 +44,15 @@ PrecisionOption = Annotated[
     Precision,
     typer.Option(
         "--precision",
-        help="Of the image backbone and the BEV encoder. bfloat16 is for a GPU or a CPU that calculates with it; on "
-        "others float32 is faster. Everything else stays in float32.",
+        help="Precision of the image backbone and the BEV encoder; the rest stays in float32. bfloat16 is faster "
+        "only on hardware that computes with it.",
     ),
 ]
 Compile = Annotated[
     bool,
     typer.Option(
         "--compile",
-        help="Compile the image backbone and the BEV encoder, for long runs on a GPU: the first frame waits for it, "
-        "up to some minutes.",
+        help="Compile the image backbone and the BEV encoder, for long runs on a GPU; the first frame takes minutes.",
     ),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
