@@ -1,6 +1,6 @@
 """Fuse polylines of your own detector into one map; no network and no data set are needed.
 
-    python examples/integrate_your_own_polylines.py
+    python examples/01_fuse_polylines.py
 
 A car drives 100 m along a straight road and sees the lane divider 1.8 m to its left, each time a little wrong.
 """

@@ -1,6 +1,6 @@
 """Draw a map as an SVG picture, without any plotting library.
 
-python examples/draw_a_map.py map.geojson map.svg
+python examples/03_draw_a_map.py map.geojson map.svg
 """
 
 import sys
