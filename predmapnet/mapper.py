@@ -18,7 +18,7 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
 from predmapnet.machine import NetworkOptions, Precision
-from predmapnet.network.image_input import Window, normalise_images, stack_windows
+from predmapnet.network.image_input import WindowPixels, normalise_images, stack_windows
 from predmapnet.network.kernels.compilation import compile_features
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
@@ -44,7 +44,7 @@ class CameraImages:
         valid: ``(N,) bool``.
     """
 
-    windows: Window
+    windows: WindowPixels
     valid: NDArray[np.bool_]
 
 

@@ -1,4 +1,4 @@
-"""From stored photographs to the network's input: scaling, the part that is seen, and normalisation.
+"""Image input: scaling, the part that the network sees, and normalisation.
 
 The mapper and the training use these same functions, so that both see the same pixels. What happens is decided by the
 kind of the configuration: the window below the sky, or the whole image as MapTracker takes it.
@@ -22,7 +22,7 @@ from mapfusion.geometry import inverse_pose
 from predmapnet.config import ImageConfig, ImageWindowConfig, WholeImageConfig
 from predmapnet.scenes import Camera, Image, Rig
 
-Window = NDArray[np.uint8] | NDArray[np.float32]
+WindowPixels = NDArray[np.uint8] | NDArray[np.float32]
 """Pixels 0 to 255. Windows are rounded; whole images are not, since MapTracker stretches floating-point images."""
 
 
@@ -89,7 +89,7 @@ def input_size(config: ImageConfig) -> tuple[int, int]:
     return config.height, config.width
 
 
-def crop_image(image: Image, camera: Camera, config: ImageConfig) -> Window:
+def crop_image(image: Image, camera: Camera, config: ImageConfig) -> WindowPixels:
     """Scale one stored image and cut out what the network sees.
 
     Args:
@@ -148,7 +148,7 @@ def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
     return ((images.float() - mean * 255.0) / deviation).movedim(-1, -3)
 
 
-def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Window, NDArray[np.bool_]]:
+def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[WindowPixels, NDArray[np.bool_]]:
     """Cut the windows of one instant.
 
     Args:

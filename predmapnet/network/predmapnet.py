@@ -1,4 +1,4 @@
-"""PredMapNet, whole: reads like Fig. 2 of the paper."""
+"""PredMapNet, the whole network: reads like Fig. 2 of the paper."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from predmapnet.config import (
     ResNet50Config,
 )
 from predmapnet.network.bev_pyramid import BevPyramid
-from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
+from predmapnet.network.former_tracks import find_former_tracks, match_tracks
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
 from predmapnet.network.history_guidance import HistoryMapGuidance
 from predmapnet.network.history_memory import HistoryRasterMapMemory
 from predmapnet.network.instance_masks import MaskHead
-from predmapnet.network.maptracker.bev_memory import keep_map
+from predmapnet.network.map_decoder import DecoderInput, MapDecoder
+from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.bevformer import BevFormer
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.maptracker.resnet import ResNet50Pyramid
-from predmapnet.network.maptracker.vector_memory import empty_vector_memory, remember
-from predmapnet.network.revival import recall, still_lost
+from predmapnet.network.maptracker.vector_memory import empty_vector_memory, store_queries
+from predmapnet.network.revival import still_lost, with_returned_tracks
 from predmapnet.network.rig_geometry import make_rig_geometry
 from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
 from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
 from predmapnet.network.small.backbone import ImageBackbone
 from predmapnet.network.small.bev_encoder import BevEncoder
-from predmapnet.network.small.bev_memory import TemporalBevFusion, empty_memory, remember_bev
-from predmapnet.network.small.decoder import MapDecoder
+from predmapnet.network.small.decoder import PointDecoder
+from predmapnet.network.small.residual_bev_memory import ResidualBevMemory, empty_bev_memory, store_raw_map
 from predmapnet.network.state import (
     BevFeatures,
     FrameInputs,
@@ -46,7 +47,6 @@ from predmapnet.network.state import (
     StreamState,
     VectorMemory,
 )
-from predmapnet.network.track_memory import match_tracks, memory_of_tracks
 from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
 from predmapnet.scenes import Rig
 
@@ -86,7 +86,7 @@ class PredMapNet(nn.Module):
         )
         self.query_generator = SemanticAwareQueryGenerator(config)
         maptracker = isinstance(config.decoder, MapTrackerDecoderConfig)
-        self.map_decoder: RowDecoder = MapTrackerDecoder(config) if maptracker else MapDecoder(config)
+        self.map_decoder: MapDecoder = MapTrackerDecoder(config) if maptracker else PointDecoder(config)
         self.propagation = PoseTrackPropagation(config) if maptracker else TrackPropagation(config)
         needs_masks = config.semantic_queries.enabled or config.history_map.memory
         self.mask_head = MaskHead(config) if needs_masks else None
@@ -95,7 +95,7 @@ class PredMapNet(nn.Module):
         self.future_guidance = ShortTermFutureGuidance(config) if config.future.enabled else None
         memory = config.temporal_bev
         residual = isinstance(memory, ResidualBevMemoryConfig) and memory.enabled
-        self.temporal_bev = TemporalBevFusion(config) if residual else None
+        self.temporal_bev = ResidualBevMemory(config) if residual else None
         needs_pyramid = isinstance(config.bev, BevFormerConfig) and config.semantic_queries.enabled
         self.bev_pyramid = BevPyramid(config.bev.widths) if needs_pyramid else None
         self.depth_head = DepthHead(config.backbone.channels, config.depth) if config.depth.enabled else None
@@ -115,7 +115,7 @@ class PredMapNet(nn.Module):
         config, device = self.config, self.device
         points, histories = config.decoder.points, config.future.histories
         floats, integers = torch.zeros(batch, 0, device=device), torch.zeros(batch, 0, dtype=torch.int64, device=device)
-        maps, poses, valid = empty_memory(batch, config, device)
+        maps, poses, valid = empty_bev_memory(batch, config, device)
         masks = torch.zeros(batch, 0, *(config.mask_size if self.mask_head is not None else (0, 0)), device=device)
         polylines = torch.zeros(batch, 0, points, 2, device=device)
         instances = Instances(
@@ -190,7 +190,7 @@ class PredMapNet(nn.Module):
         mask_features = None if self.mask_head is None else self.mask_head.mask_features(levels)
         detections = self.query_generator(levels[::-1], mask_features, self.mask_head)
         tracks, history = self._track_rows(state, inputs.ego_to_global, levels)
-        start = DecoderRows(
+        start = DecoderInput(
             queries=torch.cat([tracks.queries, detections.queries], dim=1),
             points=torch.cat([tracks.points, detections.points], dim=1),
             track_valid=tracks.valid,
@@ -207,8 +207,8 @@ class PredMapNet(nn.Module):
         return FrameOutputs(
             layers=layers,
             queries=embedding,
-            row_valid=start.valid,
-            row_track_ids=torch.cat([state.instances.track_ids, no_id], dim=1),
+            query_valid=start.valid,
+            query_track_ids=torch.cat([state.instances.track_ids, no_id], dim=1),
             segmentation=self.segmentation_head(levels[0]),
             bev=remembered,
             ego_to_global=inputs.ego_to_global,
@@ -283,9 +283,9 @@ class PredMapNet(nn.Module):
         if state is None:
             state = self.initial_state(len(inputs.ego_to_global))
         warped = outputs.warped_history if self.config.history_map.memory else None
-        memory = memory_of_tracks(instances, state, warped)
+        memory = find_former_tracks(instances, state, warped)
         if lost is not None:
-            memory = recall(memory, instances, lost, inputs.ego_to_global, self.config.roi)
+            memory = with_returned_tracks(memory, instances, lost, inputs.ego_to_global, self.config.roi)
         history_maps = instances.masks
         if memory.history_maps is not None:
             history_maps = self.history_memory.update(
@@ -319,8 +319,8 @@ class PredMapNet(nn.Module):
     def _remembered_maps(self, state: StreamState, bev: Tensor, ego_to_global: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         memory = self.config.temporal_bev
         if isinstance(memory, EncoderBevMemoryConfig):
-            return keep_map(state, bev, ego_to_global, memory)
-        return remember_bev(state, bev, ego_to_global, memory.spacing)
+            return store_bev_map(state, bev, ego_to_global, memory)
+        return store_raw_map(state, bev, ego_to_global, memory.spacing)
 
     def _remembered_queries(self, state: StreamState, instances: Instances, ego_to_global: Tensor) -> VectorMemory:
         """Store the queries; tracks that came back begin anew, as their query does."""
@@ -328,7 +328,7 @@ class PredMapNet(nn.Module):
         if memory.valid.shape[2] == 0:
             return memory
         source, matched = match_tracks(instances, state.instances)
-        return remember(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
+        return store_queries(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
 
 
 def last_motion(state: StreamState, ego_to_global: Tensor) -> Tensor:

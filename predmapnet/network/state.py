@@ -1,4 +1,4 @@
-"""What goes into the network, what comes out, and the state that is handed from frame to frame.
+"""Inputs and outputs of the network, and the state that is handed from frame to frame.
 
 ``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
 ``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
@@ -189,8 +189,8 @@ class FrameOutputs:
     Attributes:
         layers: all supervised layers, first to last; the last one is the result.
         queries: ``(B, T + Q, C)``, embedding of the last layer.
-        row_valid: ``(B, T + Q) bool``; False for padded track rows.
-        row_track_ids: ``(B, T + Q) int64``; -1 for detections.
+        query_valid: ``(B, T + Q) bool``; False for padded track rows.
+        query_track_ids: ``(B, T + Q) int64``; -1 for detections.
         segmentation: ``(B, 3, H_s, W_s)`` logits.
         bev: ``(B, C_bev, H, W)``, BEV features that go into the memory.
         ego_to_global: ``(B, 4, 4) float64``, pose of the instant.
@@ -200,8 +200,8 @@ class FrameOutputs:
 
     layers: list[LayerPredictions]
     queries: Tensor
-    row_valid: Tensor
-    row_track_ids: Tensor
+    query_valid: Tensor
+    query_track_ids: Tensor
     segmentation: Tensor
     bev: Tensor
     ego_to_global: Tensor

@@ -14,15 +14,14 @@ from predmapnet.network.small.backbone import STRIDE
 from predmapnet.network.state import RigGeometry
 from predmapnet.scenes import Rig
 from predmapnet.training.clip_losses import ClipFrame, clip_losses
-from predmapnet.training.clip_settings import ClipStage
 from predmapnet.training.data.augmentation import change_light, drop_camera
 from predmapnet.training.data.batches import RASTER_GRID, Batch, TrainingScenes
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_targets
 from predmapnet.training.data.fill_cache import window_camera
 from predmapnet.training.data.targets import truth_targets
-from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import ClipStage, TrainingSettings
 from predmapnet.training.single_frame import frame_inputs
-from predmapnet.training.workers import Workers
 
 
 class ImageClips:
@@ -85,7 +84,7 @@ class ImageClips:
 
 
 class ClipTraining:
-    """One stage of :data:`~predmapnet.training.clip_settings.CLIP_STAGES` for the training loop.
+    """One stage of :data:`~predmapnet.training.settings.CLIP_STAGES` for the training loop.
 
     Attributes:
         name: of the stage.
@@ -99,17 +98,17 @@ class ClipTraining:
         lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
-        workers: Workers,
+        processes: ProcessGroup,
     ) -> None:
-        clips = max(1, settings.batch // workers.size)
+        clips = max(1, settings.batch // processes.size)
         self.name = stage.name
         self.frames_per_step = clips * settings.clips.frames
         self._stage = stage
         self._network = network
         self._lookup = lookup
         self._settings = settings
-        self._rank = workers.rank
-        self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, workers.rank))
+        self._rank = processes.rank
+        self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, processes.rank))
 
     def begin(self) -> None:
         """Freeze what the stage leaves as it is."""

@@ -11,8 +11,8 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs, RigGeometry
 from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
 from predmapnet.training.losses.lite import frame_losses
+from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import TrainingSettings
-from predmapnet.training.workers import Workers
 
 
 def frame_inputs(batch: Batch, config: PredMapNetConfig) -> FrameInputs:
@@ -41,9 +41,9 @@ class SingleFrameStage:
         lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
-        workers: Workers,
+        processes: ProcessGroup,
     ) -> None:
-        self.frames_per_step = max(1, settings.batch // workers.size)
+        self.frames_per_step = max(1, settings.batch // processes.size)
         self._network = network
         self._lookup = lookup
         self._settings = settings
@@ -54,7 +54,7 @@ class SingleFrameStage:
             network.config.roi,
             network.config.decoder.points,
             settings.augmentation,
-            (settings.seed, workers.rank),
+            (settings.seed, processes.rank),
         )
 
     def begin(self) -> None:

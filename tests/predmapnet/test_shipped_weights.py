@@ -13,7 +13,7 @@ from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene, read_scene
+from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene
 from predmapnet.training.validation import map_frames, validate
 from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED
@@ -32,7 +32,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
     network = load_checkpoint().network
     folder = tmp_path_factory.mktemp("towns") / "scene-0002"
     cache_demo_scene(folder, network.config)
-    return Rendered(network, read_scene(folder))
+    return Rendered(network, read_cached_scene(folder))
 
 
 def mean_ap(rendered: Rendered, *, streaming: bool, **tracking: object) -> float:

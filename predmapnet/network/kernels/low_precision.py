@@ -1,4 +1,4 @@
-"""Image backbone and BEV encoder in bfloat16, for machines that multiply such numbers faster.
+"""bfloat16 in the image backbone and the BEV encoder, for machines that multiply such numbers faster.
 
 Only the products are: convolutions and linear layers, which are nearly all of the work. What decides where something is
 looked up (sampling offsets, attention weights), the look-ups themselves, norms, and everything after the BEV encoder

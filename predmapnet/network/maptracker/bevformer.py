@@ -14,9 +14,8 @@ from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.matrix_product import Linear
 from predmapnet.network.layers import ResidualPerceptron, flatten_cells
-from predmapnet.network.maptracker.bev_memory import look_back
+from predmapnet.network.maptracker.bev_memory import BevMemoryFusion, warp_past_maps
 from predmapnet.network.maptracker.camera_pillars import CameraPillars, pixel_positions
-from predmapnet.network.maptracker.temporal_fusion import TemporalFusion
 from predmapnet.network.state import FrameInputs, RigGeometry, StreamState
 
 IMAGE_LEVELS = 3
@@ -146,7 +145,7 @@ class BevEncoderLayer(nn.Module):
         self.image_attention = ImageCrossAttention(config)
         self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(3))
-        self.fusion = TemporalFusion(config.width, past_maps)
+        self.fusion = BevMemoryFusion(config.width, past_maps)
 
     def forward(
         self, cells: Tensor, code: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor, history: Tensor
@@ -192,7 +191,7 @@ class BevFormer(nn.Module):
             A single level ``(B, C, H, W)``, channels-last in memory.
         """
         assert isinstance(geometry, CameraPillars), "a rig's pillars come from make_rig_lookup"
-        history = look_back(state, inputs.ego_to_global, self.config)
+        history = warp_past_maps(state, inputs.ego_to_global, self.config)
         cells = self.first_queries(history.maps, history.valid)
         code, tokens = self.position_code(), self.image_tokens(levels)
         for layer in self.layers:

@@ -1,4 +1,4 @@
-"""BEV features: ground look-up of the image features, a position map and a U-Net over three levels."""
+"""BEV encoder of the small network: ground look-up of image features, a position map and a U-Net over three levels."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BevEncoder(nn.Module):
             levels: image features of a single level, ``(B, N, C_in, h', w')``.
             inputs: which cameras count.
             geometry: look-up of the rig.
-            state: not used; here past maps come in after the encoder (:mod:`predmapnet.network.small.bev_memory`).
+            state: not used; past maps enter afterwards (:mod:`predmapnet.network.small.residual_bev_memory`).
 
         Returns:
             ``(B, C_0, H, W)``, ``(B, C_1, H / 2, W / 2)`` and ``(B, C_2, H / 4, W / 4)``, sizes rounded up.

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.scene_cache import Images
 
 Float = NDArray[np.float64]
-Images = NDArray[np.uint8]
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""

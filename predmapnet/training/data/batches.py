@@ -1,4 +1,4 @@
-"""What one optimiser step sees. Every draw depends on seed, process and step only, so a resumed run repeats it."""
+"""Batches of one optimiser step. Every draw depends on seed, process and step only, so a resumed run repeats it."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
-from predmapnet.network.camera_order import in_learned_order
+from predmapnet.network.rig_geometry import in_learned_order
 
 
 def test_cameras_find_their_places_by_name():

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from predmapnet.network.maptracker.bev_memory import BevHistory, look_back
+from predmapnet.network.maptracker.bev_memory import PastBevMaps, warp_past_maps
 from predmapnet.network.maptracker.camera_pillars import CameraPillars, project_pillars
-from predmapnet.network.maptracker.vector_memory import age_code, recall
+from predmapnet.network.maptracker.vector_memory import age_code, recall_queries
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs, FrameOutputs, Selection, StreamState
 from predmapnet.network.track_selection import select
@@ -120,7 +120,7 @@ class Step:
 
     def fixtures(self, size: tuple[int, int], after: StreamState) -> dict[str, Tensor]:
         """Everything under the name of its fixture."""
-        history = look_back(self.state, self.inputs.ego_to_global, self.network.config)
+        history = warp_past_maps(self.state, self.inputs.ego_to_global, self.network.config)
         return (
             self.image_features()
             | self.projections(size)
@@ -152,7 +152,7 @@ class Step:
         levels = [self.out(f"image_backbone.pyramid.smooth.{level}")[None] for level in range(3)]
         return self.network.bev_encoder.image_tokens(levels)
 
-    def encoder(self, history: BevHistory) -> dict[str, Tensor]:
+    def encoder(self, history: PastBevMaps) -> dict[str, Tensor]:
         bev, encoder = self.outputs.bev, self.network.bev_encoder
         missing = bev.new_zeros(1, 4 - history.maps.shape[1], *bev.shape[1:])
         named = {
@@ -225,7 +225,7 @@ class Step:
         config, pose = self.network.config, self.inputs.ego_to_global
         distances = config.decoder.memory_distances
         motion, frame = self.network.propagation.motion, self.state.frame
-        recalled = recall(self.state.vector_memory, motion, pose, frame, distances)
+        recalled = recall_queries(self.state.vector_memory, motion, pose, frame, distances)
         entries = self.state.vector_memory.valid[0].sum(dim=-1)
         long = entries > recalled.slots.shape[-1]
         first = self.state.vector_memory.valid.shape[-1] - entries

@@ -11,15 +11,14 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures
 from predmapnet.network.track_selection import select
 from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import clip_frame
 from predmapnet.training.data.batches import Batch
-from predmapnet.training.data.streams import Clip, StreamPlan
+from predmapnet.training.data.streams import StreamPlan, StreamSegment
 from predmapnet.training.data.targets import Targets
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
-from predmapnet.training.settings import StreamSettings, TrainingSettings
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import CLIP_STAGES, ClipSettings, StreamSettings, TrainingSettings
 from predmapnet.training.temporal import TemporalStage
-from predmapnet.training.workers import Workers
 from tests.predmapnet.network.conftest import SMALL
 from tests.predmapnet.network.small_baseline import SIZE, small_config, small_pillars
 from tests.predmapnet.pretended_gpu import pretended_gpu
@@ -131,10 +130,10 @@ def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
     )
     plan = StreamPlan.start(STREAMS)
     fresh = torch.tensor([True, False])
-    clip = Clip(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
+    clip = StreamSegment(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
     with pretended_gpu() as gpu:
         gpu.put_network(network)
-        stage = TemporalStage(network, None, None, settings, tmp_path, Workers())
+        stage = TemporalStage(network, None, None, settings, tmp_path, ProcessGroup())
         for step in range(2):
             terms = stage.losses(step, clip)
         assert all(term.device == gpu.device for term in terms.values())

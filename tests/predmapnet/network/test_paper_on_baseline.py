@@ -98,7 +98,7 @@ def test_gradient_reaches_every_parameter(quirks):
     for number, both in enumerate(zip(frames(3, 0), frames(3, 1), strict=True)):
         inputs = together(list(both))
         outputs = network(inputs, pillars, state)
-        count = outputs.row_valid.shape[1]
+        count = outputs.query_valid.shape[1]
         rows = torch.arange(count - 4, count).expand(2, -1)
         instances = instances_from_rows(outputs, rows, rows >= 0, torch.arange(4).expand(2, -1) + 2 * number)
         state = network.advance(state, outputs, instances, inputs)

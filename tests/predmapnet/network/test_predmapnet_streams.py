@@ -21,8 +21,8 @@ MODULES = {
 
 def keep_rows(outputs, count, first_id=0):
     """The first ``count`` detection rows become tracks."""
-    tracks = int((outputs.row_track_ids[0] >= 0).sum())
-    rows = torch.arange(tracks, tracks + count).expand(len(outputs.row_valid), count)
+    tracks = int((outputs.query_track_ids[0] >= 0).sum())
+    rows = torch.arange(tracks, tracks + count).expand(len(outputs.query_valid), count)
     return instances_from_rows(outputs, rows, rows >= 0, torch.arange(first_id, first_id + count).expand_as(rows))
 
 
@@ -131,7 +131,7 @@ def test_padding_of_a_stream_with_fewer_tracks_changes_nothing(network, lookup, 
     ragged = replace(state, instances=replace(state.instances, valid=valid, track_ids=ids))
     inputs = make_inputs(2, x=1.5)
     outputs = network(inputs, lookup, ragged)
-    assert outputs.row_valid.tolist() == [[True] * 12, [True, True, False, False, *[True] * 8]]
+    assert outputs.query_valid.tolist() == [[True] * 12, [True, True, False, False, *[True] * 8]]
 
     short = state.tensors()
     for name, value in short.items():
@@ -149,7 +149,7 @@ def test_padding_of_a_stream_with_fewer_tracks_changes_nothing(network, lookup, 
 def test_a_track_that_left_the_roi_is_no_longer_a_row(network, lookup, make_inputs):
     state = tracked_state(network, lookup, make_inputs)
     outputs = network(make_inputs(x=200.0), lookup, state)
-    assert not outputs.row_valid[:, :3].any()
+    assert not outputs.query_valid[:, :3].any()
     assert torch.isfinite(outputs.layers[-1].points).all()
 
 

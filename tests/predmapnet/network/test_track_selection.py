@@ -36,8 +36,8 @@ def outputs(rows, state=None):
     return FrameOutputs(
         layers=[LayerPredictions(logits, (lines / ROI + 0.5)[None], torch.zeros(1, len(rows), 5, 10))],
         queries=torch.arange(len(rows)).float().reshape(1, -1, 1),
-        row_valid=torch.ones(1, len(rows), dtype=torch.bool),
-        row_track_ids=torch.tensor([ids + [-1] * (len(rows) - len(ids))]),
+        query_valid=torch.ones(1, len(rows), dtype=torch.bool),
+        query_track_ids=torch.tensor([ids + [-1] * (len(rows) - len(ids))]),
         segmentation=torch.zeros(1),
         bev=torch.zeros(1),
         ego_to_global=torch.eye(4, dtype=torch.float64)[None],

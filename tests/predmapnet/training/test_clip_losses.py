@@ -10,7 +10,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
+from predmapnet.training.settings import CLIP_STAGES, ClipSettings
 
 BEV, WARMUP, JOINT = CLIP_STAGES
 CALM = ClipSettings(angle_noise=0.0, distance_noise=0.0)
