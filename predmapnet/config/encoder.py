@@ -85,18 +85,21 @@ BackboneConfig = Annotated[
 class LookupBevConfig(Section):
     """A look-up of the image features on the ground, then a U-Net.
 
-    The look-up finds twice as many cells in each direction as the grid has.
+    On the road, the look-up finds twice as many cells in each direction as the grid has.
 
     Attributes:
         rows: of the BEV grid, along y.
         columns: of the BEV grid, along x.
         widths: channels of the three BEV levels, fine to coarse.
+        further_heights: metres above the road at which each cell of the grid looks into the images once more, for
+            roads that are not flat.
     """
 
     kind: Literal["lookup"] = "lookup"
     rows: Positive = 50
     columns: Positive = 100
     widths: tuple[Positive, Positive, Positive] = (48, 80, 128)
+    further_heights: tuple[float, ...] = ()
 
 
 class BevFormerConfig(Section):

@@ -167,7 +167,7 @@ def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) ->
 def mirror_rig(rig: Rig) -> Rig:
     """Return the rig that sees the world mirrored at the x axis through horizontally flipped images.
 
-    Training may flip images and negate y of the truth, for any rig, if it builds the look-up of this one.
+    Training flips images and negates y of the truth, and hands the network the calibration of this rig.
     """
     mirror = np.diag([1.0, -1.0, 1.0])
     flip = np.diag([-1.0, 1.0, 1.0])
@@ -180,25 +180,3 @@ def mirror_rig(rig: Rig) -> Rig:
         intrinsics[0, 2] = camera.width - intrinsics[0, 2]
         cameras.append(replace(camera, intrinsics=intrinsics, camera_to_ego=pose))
     return tuple(cameras)
-
-
-def mirror_order(rig: Rig, tolerance: float = 1e-3) -> tuple[int, ...] | None:
-    """For a mirror-symmetric rig, tell which camera takes whose place under :func:`mirror_rig`.
-
-    ``images[:, order].flip(-1)`` with y of the truth negated is then an exact new sample of the same rig.
-
-    Returns:
-        One index per camera, or None if the rig is not symmetric within ``tolerance`` (metres, and relative pixels).
-    """
-
-    def same(first: Camera, second: Camera) -> bool:
-        size_equal = (first.width, first.height) == (second.width, second.height)
-        return (
-            size_equal
-            and np.allclose(first.camera_to_ego, second.camera_to_ego, atol=tolerance)
-            and np.allclose(first.intrinsics, second.intrinsics, atol=tolerance * first.width)
-        )
-
-    mirrored = mirror_rig(rig)
-    order = [next((i for i, other in enumerate(mirrored) if same(camera, other)), -1) for camera in rig]
-    return None if -1 in order else tuple(order)

@@ -14,6 +14,7 @@ from predmapnet.config import (
     ResNet50Config,
 )
 from predmapnet.network.bev_pyramid import BevPyramid
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
 from predmapnet.network.former_tracks import find_former_tracks, match_tracks
@@ -28,7 +29,6 @@ from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.maptracker.resnet import ResNet50Pyramid
 from predmapnet.network.maptracker.vector_memory import empty_vector_memory, store_queries
 from predmapnet.network.revival import still_lost, with_returned_tracks
-from predmapnet.network.rig_geometry import make_rig_geometry
 from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
 from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
 from predmapnet.network.small.backbone import ImageBackbone
@@ -43,12 +43,11 @@ from predmapnet.network.state import (
     Instances,
     LayerPredictions,
     LostTracks,
-    RigGeometry,
     StreamState,
     VectorMemory,
+    ViewGeometry,
 )
 from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
-from predmapnet.scenes import Rig
 
 
 class PredMapNet(nn.Module):
@@ -60,7 +59,7 @@ class PredMapNet(nn.Module):
 
     One step of a stream::
 
-        outputs = net(inputs, lookup, state)
+        outputs = net(inputs, state)
         selection = select(outputs, state, net.config)
         state = net.advance(state, outputs, selection.instances, inputs, selection.lost)
     """
@@ -74,11 +73,7 @@ class PredMapNet(nn.Module):
             if isinstance(config.backbone, ResNet50Config)
             else ImageBackbone(config.backbone)
         )
-        self.bev_encoder = (
-            BevFormer(config)
-            if isinstance(config.bev, BevFormerConfig)
-            else BevEncoder(config.backbone.channels, config.bev)
-        )
+        self.bev_encoder = BevFormer(config) if isinstance(config.bev, BevFormerConfig) else BevEncoder(config)
         self.segmentation_head = (
             UpsamplingSegmentationHead(fine, classes)
             if config.segmentation.kind == "upsampling"
@@ -106,9 +101,10 @@ class PredMapNet(nn.Module):
         """Where the parameters are."""
         return self.query_generator.content.device
 
-    def make_rig_lookup(self, rig: Rig) -> RigGeometry:
-        """Precompute where a rig sees the ground (cameras at the size of their stored images)."""
-        return make_rig_geometry(rig, self.config).to(self.device)
+    def view_geometry(self, calibration: Calibration) -> ViewGeometry:
+        """Find where the cameras of some frames see the ground; the result serves as long as no camera moves."""
+        geometry: ViewGeometry = self.bev_encoder.geometry(calibration)
+        return geometry
 
     def initial_state(self, batch: int) -> StreamState:
         """Return the state before the first frame of ``batch`` streams: no tracks, nothing remembered."""
@@ -143,41 +139,57 @@ class PredMapNet(nn.Module):
             vector_memory=empty_vector_memory(batch, config, device),
         )
 
-    def forward(self, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None) -> FrameOutputs:
+    def forward(
+        self, inputs: FrameInputs, state: StreamState | None = None, geometry: ViewGeometry | None = None
+    ) -> FrameOutputs:
         """Map one instant of ``B`` streams.
 
         Args:
-            inputs: images, which cameras count, and poses.
-            lookup: of the rig that took the images.
+            inputs: images, cameras and poses.
             state: of the last frame; None or an empty state makes it a single-frame network.
+            geometry: :meth:`view_geometry` of these cameras, if it is known; found here otherwise.
         """
-        return self.decode_bev(self.encode_bev(self.encode_images(inputs), inputs, lookup, state), inputs, state)
+        bev = self.encode_bev(self.encode_images(inputs), inputs, state, geometry)
+        return self.decode_bev(bev, inputs, state)
 
     def encode_images(self, inputs: FrameInputs) -> ImageFeatures:
         """From images to image features: no memory and no geometry yet."""
-        batch = len(inputs.images)
-        # What a masked camera saw must not reach anything: not batch statistics, not even as not-a-number.
-        images = inputs.images.masked_fill(~inputs.camera_valid[:, :, None, None, None], 0.0)
-        levels = self.image_backbone(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-        depth = None
-        if self.depth_head is not None and self.training:
-            depth = self.depth_head(levels[0]).unflatten(0, (batch, -1))
-        return ImageFeatures([level.unflatten(0, (batch, -1)) for level in levels], depth)
+        valid = inputs.camera_valid
+        # What a masked camera saw must not reach anything, not even as not-a-number.
+        images = inputs.images.masked_fill(~valid[:, :, None, None, None], 0.0).flatten(0, 1)
+        seen = valid.flatten().nonzero()[:, 0] if self.training else None
+        if seen is not None and 0 < len(seen) < len(images):  # Black images would enter the batch statistics.
+            images = images[seen]
+        else:
+            seen = None
+        levels = self.image_backbone(images.contiguous(memory_format=torch.channels_last))
+        depth = self.depth_head(levels[0]) if self.depth_head is not None and self.training else None
+
+        def of_cameras(features: Tensor) -> Tensor:
+            return (features if seen is None else _spread(features, seen, valid.numel())).unflatten(0, valid.shape)
+
+        return ImageFeatures([of_cameras(level) for level in levels], None if depth is None else of_cameras(depth))
 
     def encode_bev(
-        self, images: ImageFeatures, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None
+        self,
+        images: ImageFeatures,
+        inputs: FrameInputs,
+        state: StreamState | None = None,
+        geometry: ViewGeometry | None = None,
     ) -> BevFeatures:
         """From image features to BEV features; with the encoder ``bevformer`` the BEV memory takes part.
 
         Args:
             images: of :meth:`encode_images`.
-            inputs: which cameras count, and poses.
-            lookup: of the rig that took the images.
+            inputs: cameras and poses.
             state: of the last frame.
+            geometry: :meth:`view_geometry` of these cameras, if it is known.
         """
         if state is None:
             state = self.initial_state(len(inputs.camera_valid))
-        levels = self.bev_encoder(images.levels, inputs, lookup, state)
+        if geometry is None:
+            geometry = self.view_geometry(inputs.calibration)
+        levels = self.bev_encoder(images.levels, inputs, geometry, state)
         if self.bev_pyramid is not None:
             levels = self.bev_pyramid(levels[0])
         return BevFeatures(levels, images.depth)
@@ -329,6 +341,12 @@ class PredMapNet(nn.Module):
             return memory
         source, matched = match_tracks(instances, state.instances)
         return store_queries(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
+
+
+def _spread(features: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Put features ``(M, C, h, w)`` into these rows of ``(count, C, h, w)``, channels-last; the others are zero."""
+    pixels = features.permute(0, 2, 3, 1)
+    return pixels.new_zeros(count, *pixels.shape[1:]).index_copy(0, rows, pixels).permute(0, 3, 1, 2)
 
 
 def last_motion(state: StreamState, ego_to_global: Tensor) -> Tensor:

@@ -14,26 +14,29 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from predmapnet.network.maptracker.camera_pillars import CameraPillars
-from predmapnet.network.small.ground_lookup import RigLookup
+from predmapnet.network.calibration import Calibration
+from predmapnet.network.maptracker.reference_points import ReferencePoints
+from predmapnet.network.small.ground_lookup import GroundLookup
 
-RigGeometry = RigLookup | CameraPillars
-"""What is computed once per camera rig: a look-up for the BEV encoder ``lookup``, pillars for ``bevformer``."""
+ViewGeometry = GroundLookup | ReferencePoints
+"""Where the cameras of some frames see the ground, as the BEV encoder takes it; may be kept while they stay put."""
 
 
 @dataclass
 class FrameInputs:
-    """One instant of ``B`` streams that share a camera rig.
+    """One instant of ``B`` streams, of any cars; ``N`` is the largest number of cameras.
 
     Attributes:
         images: ``(B, N, 3, h, w) float32``, as :func:`predmapnet.network.image_input.normalise_images` makes them.
-        camera_valid: ``(B, N) bool``; False masks a missing or late camera out.
+        camera_valid: ``(B, N) bool``; False for a missing or late camera, and in padding.
         ego_to_global: ``(B, 4, 4) float64``.
+        calibration: of the cameras.
     """
 
     images: Tensor
     camera_valid: Tensor
     ego_to_global: Tensor
+    calibration: Calibration
 
 
 @dataclass

@@ -19,7 +19,7 @@ from predmapnet.network.ego_motion import relative_pose
 from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, RigGeometry, StreamState
+from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, StreamState
 from predmapnet.network.track_propagation import PoseTrackPropagation
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss
@@ -75,7 +75,6 @@ class Past:
 
 def clip_losses(
     network: PredMapNet,
-    lookup: RigGeometry,
     clip: Sequence[ClipFrame],
     stage: ClipStage,
     settings: ClipSettings,
@@ -88,7 +87,6 @@ def clip_losses(
 
     Args:
         network: with MapTracker's decoder and BEV memory, in training mode.
-        lookup: of the rig that took the images.
         clip: frames in time order.
         stage: what is trained.
         settings: weights and noise.
@@ -109,7 +107,7 @@ def clip_losses(
         with torch.set_grad_enabled(stage.trains_images(number, len(clip))):
             images = network.encode_images(frame.inputs)
             _add(terms, _depth_terms(images, frame, settings))
-        bev = network.encode_bev(images, frame.inputs, lookup, seen)
+        bev = network.encode_bev(images, frame.inputs, seen)
         if not stage.vectors:
             _add(terms, _segmentation_terms(network.segmentation_head(bev.levels[0]), frame.targets))
             maps = store_bev_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig, ResNet50Config
+from predmapnet.network.calibration import collate_calibrations, pad_cameras
 from predmapnet.network.image_input import input_size
-from predmapnet.network.maptracker.camera_pillars import LEVEL_STRIDES
+from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.small.backbone import STRIDE
-from predmapnet.network.state import RigGeometry
 from predmapnet.scenes import Rig
 from predmapnet.training.clip_losses import ClipFrame, clip_losses
 from predmapnet.training.data.augmentation import change_light, drop_camera
@@ -61,11 +61,12 @@ class ImageClips:
         valid = [drop_camera(len(frame.images), augmentation, generator) for frame in loaded]
         depth = None
         if config.depth.enabled:
-            depth = torch.from_numpy(np.stack([self._depth(scene, frame) for scene, frame in frames]))
+            depth = pad_cameras([self._depth(scene, frame) for scene, frame in frames])
         return Batch(
-            images=torch.from_numpy(np.stack(images)),
-            camera_valid=torch.from_numpy(np.stack(valid)),
+            images=pad_cameras(images),
+            camera_valid=pad_cameras(valid),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            calibration=collate_calibrations([frame.calibration for frame in loaded]),
             targets=truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, RASTER_GRID),
             depth=depth,
         )
@@ -95,7 +96,6 @@ class ClipTraining:
         self,
         stage: ClipStage,
         network: PredMapNet,
-        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
         processes: ProcessGroup,
@@ -105,7 +105,6 @@ class ClipTraining:
         self.frames_per_step = clips * settings.clips.frames
         self._stage = stage
         self._network = network
-        self._lookup = lookup
         self._settings = settings
         self._rank = processes.rank
         self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, processes.rank))
@@ -123,7 +122,7 @@ class ClipTraining:
         seed = np.random.default_rng([self._settings.seed, self._rank, 3, step]).integers(2**62)
         generator = torch.Generator().manual_seed(int(seed))
         clip = [clip_frame(instant, self._network) for instant in batch]
-        return clip_losses(self._network, self._lookup, clip, self._stage, self._settings.clips, step, generator)
+        return clip_losses(self._network, clip, self._stage, self._settings.clips, step, generator)
 
     def state(self) -> dict[str, Tensor]:
         """Nothing is carried from step to step."""

@@ -148,26 +148,27 @@ def _run_stages(options: RunOptions, processes: ProcessGroup, report: Report) ->
     trainer = Trainer(network, settings, options.folder, processes, report)
     if options.resume:
         trainer.resume()
-    scenes = TrainingScenes([read_cached_scene(_cache(options) / name) for name in _names(options, "train")])
+    scenes = TrainingScenes(
+        [read_cached_scene(_cache(options) / name) for name in _names(options, "train")], options.config
+    )
     validation = (
         [read_cached_scene(_cache(options) / name) for name in _names(options, "val")] if processes.leads else []
     )
-    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
 
     def measure(average: PredMapNet, stage: str) -> dict[str, float]:
-        return validate(average, lookup, validation, streaming=stage != SingleFrameStage.name)
+        return validate(average, validation, streaming=stage != SingleFrameStage.name)
 
     for clip_stage, budget in settings.clip_stages:
-        clips = ClipTraining(clip_stage, network, lookup, scenes, settings, processes)
+        clips = ClipTraining(clip_stage, network, scenes, settings, processes)
         optimiser = replace(settings.clip_optimiser, rates=clip_stage.rates, final_fraction=clip_stage.final_rate)
         if not trainer.run(clips, budget, optimiser, measure if clip_stage.vectors else _no_measure):
             return False
     if settings.single is not None:
-        single = SingleFrameStage(network, lookup, scenes, settings, processes)
+        single = SingleFrameStage(network, scenes, settings, processes)
         if not trainer.run(single, settings.single, settings.optimiser, measure):
             return False
     if settings.temporal is not None:
-        temporal = TemporalStage(network, lookup, scenes, settings, options.folder, processes, report)
+        temporal = TemporalStage(network, scenes, settings, options.folder, processes, report)
         return trainer.run(temporal, settings.temporal, settings.temporal_optimiser, measure)
     return True
 

@@ -14,9 +14,10 @@ from torch import Tensor
 from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
+from predmapnet.network.calibration import collate_calibrations
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
+from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.data.streams import FeatureStore, StreamPlan, StreamSegment, StreamSegments
@@ -44,7 +45,6 @@ class TemporalStage:
     def __init__(
         self,
         network: PredMapNet,
-        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
         folder: Path,
@@ -53,7 +53,6 @@ class TemporalStage:
     ) -> None:
         self.frames_per_step = settings.streams.streams * settings.streams.frames
         self._network = network
-        self._lookup = lookup
         self._scenes = scenes
         self._settings = settings
         self._folder = folder
@@ -102,7 +101,7 @@ class TemporalStage:
         terms: dict[str, Tensor] = {}
         following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
         for instant, features, coming in zip(batch.instants, batch.features, following, strict=True):
-            inputs = FrameInputs(features.levels[0].new_zeros(0), instant.camera_valid, instant.ego_to_global)
+            inputs = FrameInputs(instant.images, instant.camera_valid, instant.ego_to_global, instant.calibration)
             outputs = self._network.decode_bev(features, inputs, state)
             rows = state.instances.valid.shape[1]
             points = outputs.layers[-1].points
@@ -178,8 +177,9 @@ class TemporalStage:
                     normalised = normalise_images(images, self._network.config.image)
                     valid = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
                     anywhere = torch.zeros(stop - start, 4, 4, dtype=torch.float64, device=images.device)
-                    inputs = FrameInputs(normalised, valid, anywhere)
-                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs, self._lookup)
+                    calibration = collate_calibrations([frame.calibration for frame in loaded]).to(images.device)
+                    inputs = FrameInputs(normalised, valid, anywhere, calibration)
+                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs)
                     values[start:stop] = store.pack(features)
             if self._processes.leads and done % 10 == 9:
                 self._report(f"BEV features: {done + 1}/{len(mine)} scenes of this process")

@@ -11,9 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.machine import Precision
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.maptracker.bevformer import BevSelfAttention, ImageCrossAttention
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import ViewGeometry
 
 
 def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:
@@ -41,6 +43,11 @@ class _LowPrecision(nn.Module):
                 for name, parameter in module.named_parameters(recurse=False):
                     low = nn.Parameter(parameter.to(torch.bfloat16), requires_grad=False)
                     module.register_parameter(name, low)
+
+    def geometry(self, calibration: Calibration) -> ViewGeometry:
+        """Return the geometry of the BEV encoder, which is exact."""
+        found: ViewGeometry = self.part.geometry(calibration)
+        return found
 
     def forward(self, *arguments: object) -> list[Tensor]:
         """Compute what the part computes."""

@@ -118,19 +118,3 @@ def read_cached_scene(folder: Path) -> CachedScene:
 def _camera(entry: dict[str, object]) -> Camera:
     matrices = {name: np.array(entry[name], dtype=np.float64) for name in ("intrinsics", "camera_to_ego")}
     return Camera(**{**entry, **matrices})  # type: ignore[arg-type]
-
-
-def same_rig(first: Rig, second: Rig, tolerance: float = 0.03) -> bool:
-    """Whether two rigs are the same cameras in the same places.
-
-    Args:
-        first, second: rigs.
-        tolerance: largest difference of poses, metres (small enough for the pitch of the car between two instants);
-            focal lengths may differ by that part of ten pixels.
-    """
-    return len(first) == len(second) and all(
-        (one.name, one.width, one.height) == (other.name, other.width, other.height)
-        and np.allclose(one.intrinsics, other.intrinsics, rtol=0.0, atol=10 * tolerance)
-        and np.allclose(one.camera_to_ego, other.camera_to_ego, rtol=0.0, atol=tolerance)
-        for one, other in zip(first, second, strict=True)
-    )

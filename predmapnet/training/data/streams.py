@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mapfusion.elements import RegionOfInterest
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.batches import RASTER_GRID, Batch, LoadedFrame, TrainingScenes
@@ -179,11 +180,11 @@ class StreamSegments:
 
     def _instant(self, plan: StreamPlan, offset: int) -> Batch:
         loaded = [self._load(int(s), int(f) + offset) for s, f in zip(plan.scene, plan.frame, strict=True)]
-        cameras = len(self._scenes.scenes[0].rig)
         return Batch(
             images=torch.zeros((len(loaded), 0, 0, 0, 3), dtype=torch.uint8),
-            camera_valid=torch.ones((len(loaded), cameras), dtype=torch.bool),
+            camera_valid=torch.ones((len(loaded), 0), dtype=torch.bool),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            calibration=Calibration.empty(len(loaded)),
             targets=truth_targets([frame.truth for frame in loaded], self._roi, self._points, RASTER_GRID),
         )
 

@@ -45,7 +45,7 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> TrainingScenes:
     folder = tmp_path_factory.mktemp("scenes")
-    return TrainingScenes([painted_scene(folder / f"scene-{i}", 6, i, tiny_config()) for i in range(2)])
+    return TrainingScenes([painted_scene(folder / f"scene-{i}", 6, i, tiny_config()) for i in range(2)], tiny_config())
 
 
 class PowerCutError(Exception):
@@ -55,12 +55,11 @@ class PowerCutError(Exception):
 def run(folder: Path, scenes: TrainingScenes, resume: bool = False, cut_at: tuple[str, int] | None = None) -> Trainer:
     torch.manual_seed(3)
     network = PredMapNet(tiny_config())
-    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
     trainer = Trainer(network, SETTINGS, folder, ProcessGroup(), lambda _line: None)
     if resume:
         trainer.resume()
-    single = SingleFrameStage(network, lookup, scenes, SETTINGS, ProcessGroup())
-    temporal = TemporalStage(network, lookup, scenes, SETTINGS, folder, ProcessGroup(), lambda _line: None)
+    single = SingleFrameStage(network, scenes, SETTINGS, ProcessGroup())
+    temporal = TemporalStage(network, scenes, SETTINGS, folder, ProcessGroup(), lambda _line: None)
     for stage, budget in ((single, SETTINGS.single), (temporal, SETTINGS.temporal)):
         if cut_at is not None and stage.name == cut_at[0]:
             cut(stage, cut_at[1])
@@ -129,9 +128,7 @@ def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Pat
 
 def test_streams_of_an_older_version_go_on_without_their_past(tmp_path: Path, scenes: TrainingScenes) -> None:
     network = PredMapNet(tiny_config())
-    stage = TemporalStage(
-        network, network.make_rig_lookup(scenes.scenes[0].rig), scenes, SETTINGS, tmp_path, ProcessGroup()
-    )
+    stage = TemporalStage(network, scenes, SETTINGS, tmp_path, ProcessGroup())
     whole = stage.state()
     older = {name.removeprefix("state."): value for name, value in whole.items() if name.startswith("state.instances.")}
     older |= {name: value for name, value in whole.items() if name.startswith(("plan.", "owners."))}
