@@ -21,6 +21,7 @@ from predmapnet.network.former_tracks import find_former_tracks, match_tracks
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
 from predmapnet.network.history_guidance import HistoryMapGuidance
 from predmapnet.network.history_memory import HistoryRasterMapMemory
+from predmapnet.network.image_input import input_size
 from predmapnet.network.instance_masks import MaskHead
 from predmapnet.network.map_decoder import DecoderInput, MapDecoder
 from predmapnet.network.maptracker.bev_memory import store_bev_map
@@ -101,9 +102,14 @@ class PredMapNet(nn.Module):
         """Where the parameters are."""
         return self.query_generator.content.device
 
-    def view_geometry(self, calibration: Calibration) -> ViewGeometry:
-        """Find where the cameras of some frames see the ground; the result serves as long as no camera moves."""
-        geometry: ViewGeometry = self.bev_encoder.geometry(calibration)
+    def view_geometry(self, calibration: Calibration, size: tuple[int, int] | None = None) -> ViewGeometry:
+        """Find where the cameras of some frames see the ground; the result serves as long as no camera moves.
+
+        Args:
+            calibration: of the frames.
+            size: rows and columns of the network's input, if not those of the configuration.
+        """
+        geometry: ViewGeometry = self.bev_encoder.geometry(calibration, size or input_size(self.config.image))
         return geometry
 
     def initial_state(self, batch: int) -> StreamState:
@@ -188,7 +194,8 @@ class PredMapNet(nn.Module):
         if state is None:
             state = self.initial_state(len(inputs.camera_valid))
         if geometry is None:
-            geometry = self.view_geometry(inputs.calibration)
+            rows, columns = inputs.images.shape[-2:]
+            geometry = self.view_geometry(inputs.calibration, (rows, columns))
         levels = self.bev_encoder(images.levels, inputs, geometry, state)
         if self.bev_pyramid is not None:
             levels = self.bev_pyramid(levels[0])

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from predmapnet.machine import Precision
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
-from predmapnet.network.maptracker.bevformer import BevSelfAttention, ImageCrossAttention
+from predmapnet.network.maptracker.bevformer import BevFormer, BevSelfAttention, ImageCrossAttention
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.small.bev_encoder import BevEncoder
 from predmapnet.network.state import ViewGeometry
 
 
@@ -44,10 +45,10 @@ class _LowPrecision(nn.Module):
                     low = nn.Parameter(parameter.to(torch.bfloat16), requires_grad=False)
                     module.register_parameter(name, low)
 
-    def geometry(self, calibration: Calibration) -> ViewGeometry:
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> ViewGeometry:
         """Return the geometry of the BEV encoder, which is exact."""
-        found: ViewGeometry = self.part.geometry(calibration)
-        return found
+        assert isinstance(self.part, BevEncoder | BevFormer)
+        return self.part.geometry(calibration, size)
 
     def forward(self, *arguments: object) -> list[Tensor]:
         """Compute what the part computes."""

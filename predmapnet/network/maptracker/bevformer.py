@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
 from predmapnet.network.calibration import Calibration
-from predmapnet.network.image_input import input_size
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.matrix_product import Linear
 from predmapnet.network.layers import ResidualPerceptron, flatten_cells
@@ -180,9 +179,9 @@ class BevFormer(nn.Module):
         self.register_buffer("pillars", pillar_points(bev, config.roi), persistent=False)
         self.pillars: Tensor
 
-    def geometry(self, calibration: Calibration) -> ReferencePoints:
-        """Find where the cameras of some frames see the BEV cells."""
-        return find_references(calibration.ego_to_image, input_size(self.config.image), self.pillars)
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> ReferencePoints:
+        """Find where the cameras of some frames, whose input has ``size`` (rows, columns), see the BEV cells."""
+        return find_references(calibration.ego_to_image, size, self.pillars)
 
     def forward(
         self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState

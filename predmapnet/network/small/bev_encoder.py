@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.network.calibration import Calibration
-from predmapnet.network.image_input import input_size
-from predmapnet.network.layers import ConvNorm, Convolution, Linear, ResidualBlock, zero_init
+from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.layers import ConvNorm, Convolution, ResidualBlock, zero_init
 from predmapnet.network.small.backbone import STRIDE
 from predmapnet.network.small.ground_lookup import GroundLookup, find_on_ground, ground_points, to_ground
 from predmapnet.network.state import FrameInputs, StreamState, ViewGeometry
@@ -28,7 +28,6 @@ class BevEncoder(nn.Module):
         bev, channels_in = config.bev, config.backbone.channels
         assert isinstance(bev, LookupBevConfig)
         fine, middle, coarse = bev.widths
-        self.feature_size = tuple(-(-size // STRIDE) for size in input_size(config.image))
         self.fine_grid, grid = (2 * bev.rows, 2 * bev.columns), (bev.rows, bev.columns)
         points = [ground_points(self.fine_grid, 0.0, config.roi)]
         points += [ground_points(grid, height, config.roi) for height in bev.further_heights]
@@ -49,10 +48,10 @@ class BevEncoder(nn.Module):
         self.middle_to_fine = ConvNorm(middle, fine, 1, relu=False)
         self.fine_out = ResidualBlock(fine, fine)
 
-    def geometry(self, calibration: Calibration) -> GroundLookup:
-        """Find where the cameras of some frames see the ground."""
-        rows, columns = self.feature_size
-        return find_on_ground(self.points, calibration, (rows, columns), STRIDE)
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> GroundLookup:
+        """Find where the cameras of some frames, whose input has ``size`` (rows, columns), see the ground."""
+        features = -(-size[0] // STRIDE), -(-size[1] // STRIDE)
+        return find_on_ground(self.points, calibration, features, STRIDE)
 
     def forward(
         self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState | None

@@ -147,15 +147,16 @@ def test_each_height_has_weights_of_its_own():
     config = PredMapNetConfig.model_validate(SMALL)
     grid, channels = (config.bev.rows, config.bev.columns), config.backbone.channels
     calibration = calibrate(DEMO_RIG, config)
-    features = torch.randn(1, len(DEMO_RIG), channels, *encoder.feature_size)
+    size = (config.image.height, config.image.width)
+    features = torch.randn(1, len(DEMO_RIG), channels, size[0] // STRIDE, size[1] // STRIDE)
     valid = torch.ones(1, len(DEMO_RIG), dtype=torch.bool)
-    found = to_ground(features, valid, encoder.geometry(calibration))
+    found = to_ground(features, valid, encoder.geometry(calibration, size))
     encoder.heights.weight.zero_()
     road = encoder._combined(found)
     for number, height in enumerate((-0.5, 0.5)):
         encoder.heights.weight.zero_()
         encoder.heights.weight[:channels, number * channels : (number + 1) * channels] = torch.eye(channels)
-        there = find_on_ground(ground_points(grid, height, config.roi), calibration, encoder.feature_size, STRIDE)
+        there = find_on_ground(ground_points(grid, height, config.roi), calibration, features.shape[-2:], STRIDE)
         expected = to_ground(features, valid, there)[0].T.unflatten(1, grid)
         added = (encoder._combined(found) - road)[0]
         torch.testing.assert_close(added[:channels], expected, rtol=1e-4, atol=1e-4)

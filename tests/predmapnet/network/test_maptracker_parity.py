@@ -78,7 +78,7 @@ def run(request) -> Run:
         pytest.skip(f"no reference fixtures in {FOLDER}: set PREDMAPNET_REFERENCE")
     reference, size = load_reference(), request.param
     network, frames = reference.network, reference.frames(size)
-    references = network.view_geometry(reference.calibration(size))
+    references = network.view_geometry(reference.calibration(size), size)
     state, result = network.initial_state(1), Run()
     with torch.no_grad():
         for frame in range(frames):
