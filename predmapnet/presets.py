@@ -13,6 +13,7 @@ from predmapnet.config import (
     EncoderBevMemoryConfig,
     FutureConfig,
     HistoryMapConfig,
+    LookupBevConfig,
     MapTrackerDecoderConfig,
     MaskConfig,
     PredMapNetConfig,
@@ -78,7 +79,9 @@ _ARGOVERSE2 = _maptracker("maptracker-av2", WholeImageConfig(width=608, height=6
 PRESETS = {
     config.name: config
     for config in (
-        PredMapNetConfig(name="lite", future=FutureConfig(steady_motion=True)),
+        PredMapNetConfig(
+            name="lite", bev=LookupBevConfig(further_heights=(-0.5, 0.5)), future=FutureConfig(steady_motion=True)
+        ),
         _paper("paper-nuscenes", _NUSCENES),
         _paper("paper-av2", _ARGOVERSE2),
         _NUSCENES,

@@ -9,9 +9,15 @@ from torch import Tensor, nn
 
 from predmapnet.config import PointDecoderConfig, PredMapNetConfig
 from predmapnet.network.instance_masks import MaskHead, attention_cells
-from predmapnet.network.layers import Attention, FeedForward, Perceptron, cell_centres, flatten_cells, sine_code
-
-FREQUENCIES = 6
+from predmapnet.network.layers import (
+    SINE_FREQUENCIES,
+    Attention,
+    FeedForward,
+    Perceptron,
+    cell_centres,
+    flatten_cells,
+    sine_code,
+)
 
 
 @dataclass
@@ -80,7 +86,7 @@ class SemanticAwareQueryGenerator(nn.Module):
         count = config.semantic_queries.layers
         self.layers = nn.ModuleList(MaskedAttentionLayer(decoder.width, decoder.heads) for _ in range(count))
         self.level_inputs = nn.ModuleList(nn.Linear(width, decoder.width) for width in config.bev.widths[::-1][:count])
-        self.cell_code = nn.Linear(4 * FREQUENCIES, decoder.width)
+        self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, decoder.width)
         self.classify = nn.Linear(decoder.width, decoder.classes)
         nn.init.constant_(self.classify.bias, -3.0)
 
@@ -104,7 +110,9 @@ class SemanticAwareQueryGenerator(nn.Module):
             for number, layer in enumerate(self.layers):
                 turn = number % len(inputs)
                 rows, columns = levels[turn].shape[-2:]
-                code = self.cell_code(sine_code(cell_centres(rows, columns, queries.device), FREQUENCIES).flatten(0, 1))
+                code = self.cell_code(
+                    sine_code(cell_centres(rows, columns, queries.device), SINE_FREQUENCIES).flatten(0, 1)
+                )
                 allowed = attention_cells(masks[-1].detach(), (rows, columns), self.threshold)
                 queries = layer(queries, self.position, inputs[turn], code, allowed)
                 logits.append(self.classify(queries))

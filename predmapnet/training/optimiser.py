@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-Network = TypeVar("Network", bound=nn.Module)
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> fl
     return settings.learning_rate * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
 
 
-class WeightAverage(Generic[Network]):
+class WeightAverage(Generic[_Network]):
     """Exponential moving average of a network's parameters and buffers.
 
     The decay starts low, ``(1 + updates) / (10 + updates)``, so that the average soon forgets the random start.
@@ -84,8 +84,8 @@ class WeightAverage(Generic[Network]):
         updates: how often it was updated.
     """
 
-    def __init__(self, network: Network, decay: float) -> None:
-        self.network: Network = copy.deepcopy(network).eval().requires_grad_(False)
+    def __init__(self, network: _Network, decay: float) -> None:
+        self.network: _Network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay = decay
         self.updates = 0
 

@@ -1,10 +1,10 @@
-"""Fill the training cache: demo towns rendered straight at the network's size, or a data set's images, cropped."""
+"""Fill the training cache: demo towns, rendered straight at the network's size."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from hashlib import sha256
@@ -12,20 +12,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from predmapnet.config import ImageWindowConfig, PredMapNetConfig
-from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import crop_image, image_window, window_intrinsics
-from predmapnet.scenes import Camera, Scene
-from predmapnet.training.data.scene_cache import write_scene
+from predmapnet.network.image_input import image_window, window_intrinsics
+from predmapnet.scenes import Camera
+from predmapnet.training.data.scene_cache import write_cached_scene
+from predmapnet.training.settings import Report
 
 DEMO = "demo"
 OVERSAMPLING = 2
 """Demo images are rendered at this many times the network's size and averaged down, as preprocessing does."""
-
-Report = Callable[[str], None]
 
 
 def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
@@ -118,7 +115,7 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
         lidar_to_shifted = ego_to_shifted @ LIDAR_TO_EGO
         sweeps = (scan(renderer, frame)[:, :3].astype(np.float64) for frame in range(len(poses)))
         lidar = [sweep @ lidar_to_shifted[:3, :3].T + lidar_to_shifted[:3, 3] for sweep in sweeps]
-    write_scene(folder, rig, images, shifted, truths, lidar)
+    write_cached_scene(folder, rig, images, shifted, truths, lidar)
 
 
 def window_camera(camera: Camera, config: PredMapNetConfig, factor: int) -> Camera:
@@ -136,34 +133,3 @@ def window_camera(camera: Camera, config: PredMapNetConfig, factor: int) -> Came
         height=config.image.height * factor,
         intrinsics=np.diag([factor, factor, 1.0]) @ window_intrinsics(camera, config.image),
     )
-
-
-def cache_scene(folder: Path, scene: Scene, config: PredMapNetConfig) -> None:
-    """Read, scale and crop the images of one scene of any data set.
-
-    Frames that lack an image stay out: the cache has no place for missing cameras.
-
-    Raises:
-        UserError: an image is damaged, or the scene has no ground truth or lacks lidar from which depth is learned.
-    """
-    images: list[NDArray[np.uint8]] = []
-    poses, truths, sweeps = [], [], []
-    for index in range(len(scene)):
-        frame = scene.frame(index)
-        truth = scene.truth(index, config.roi)
-        if truth is None:
-            raise UserError(f"Scene {scene.info.name} has no ground truth to train on.")
-        if any(camera.name not in frame.images for camera in frame.rig):
-            continue
-        pictures = [crop_image(read_image(frame.images[c.name]), c, config.image) for c in frame.rig]
-        images.append(np.rint(pictures).astype(np.uint8))
-        poses.append(frame.ego_to_global)
-        truths.append(truth)
-        if config.depth.enabled:
-            sweep = scene.lidar(index)
-            if sweep is None:
-                raise UserError(f"Scene {scene.info.name}, frame {index}, has no lidar file to learn depth from.")
-            sweeps.append(sweep)
-    if not images:
-        raise UserError(f"Scene {scene.info.name} has no frame with all cameras.")
-    write_scene(folder, scene.rig, np.stack(images), np.stack(poses), truths, sweeps or None)

@@ -7,8 +7,8 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.small.ground_lookup import RigLookup
 from predmapnet.network.state import FrameInputs
 
 SMALL = {
@@ -40,11 +40,6 @@ def network(make_network: Callable[..., PredMapNet]) -> PredMapNet:
 
 
 @pytest.fixture
-def lookup(network: PredMapNet) -> RigLookup:
-    return network.make_rig_lookup(DEMO_RIG)
-
-
-@pytest.fixture
 def make_inputs(network: PredMapNet) -> Callable[..., FrameInputs]:
     """Return a maker of random frames; ``x`` moves the car forward, metres."""
 
@@ -57,6 +52,7 @@ def make_inputs(network: PredMapNet) -> Callable[..., FrameInputs]:
             images=torch.randn(batch, len(DEMO_RIG), 3, image.height, image.width, generator=generator),
             camera_valid=torch.ones(batch, len(DEMO_RIG), dtype=torch.bool),
             ego_to_global=pose,
+            calibration=collate_calibrations([calibrate(DEMO_RIG, network.config)] * batch),
         )
 
     return make

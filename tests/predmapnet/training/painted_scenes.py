@@ -14,7 +14,7 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.presets import preset
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.scene_cache import CachedScene, read_scene, write_scene
+from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene, write_cached_scene
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))
 
@@ -53,8 +53,8 @@ def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig
         truths.append(truth)
         images.append(_paint(truth, config))
     sweeps = [generator.uniform([-40, -20, 0], [40, 20, 3], (2000, 3)) for _ in poses] if config.depth.enabled else None
-    write_scene(folder, DEMO_RIG, np.stack(images), poses, truths, sweeps)
-    return read_scene(folder)
+    write_cached_scene(folder, DEMO_RIG, np.stack(images), poses, truths, sweeps)
+    return read_cached_scene(folder)
 
 
 def _truth(lines: list, pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:
