@@ -1,8 +1,10 @@
 """The paper's modules at sizes for tests, with every branch open, and frames that begin at the BEV features."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +14,7 @@ from predmapnet.network.layers import Attention
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures, FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
-from predmapnet.presets import preset
+from predmapnet.presets import parse_config, preset
 from tests.predmapnet.network.small_baseline import small_config
 
 SIZES = ("paper", "lite")
@@ -48,9 +50,17 @@ def opened(module: nn.Module, seed: int = 0) -> nn.Module:
     return module.eval()
 
 
-def tiny_network(size: str, seed: int = 0, **sections: dict[str, object]) -> PredMapNet:
-    torch.manual_seed(seed)
-    return opened(PredMapNet(tiny_config(size, **sections)))
+def tiny_network(size: str, **sections: dict[str, object]) -> PredMapNet:
+    """Return an open network without its image backbone, which takes most of the time and is not asked for here."""
+    return copy.deepcopy(_built(tiny_config(size, **sections).to_json()))
+
+
+@cache
+def _built(config: str) -> PredMapNet:
+    torch.manual_seed(0)
+    network = PredMapNet(parse_config(config, "test"))
+    network.image_backbone = nn.Identity()
+    return opened(network)
 
 
 def bev_levels(config: PredMapNetConfig, batch: int = 1, seed: int = 0) -> list[Tensor]:
