@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from predmapnet.config import EncoderBevMemoryConfig
 from predmapnet.errors import UserError
-from predmapnet.network.ego_motion import relative_pose
+from predmapnet.network.ego_motion import relative_motion, relative_pose
 from predmapnet.network.maptracker.bev_memory import keep_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
@@ -296,6 +296,10 @@ def _next_tracks(
         # One more entry stands for "none", so that -1 can be looked up.
         return functional.pad(values, (0, 1), value=-1)[truth]
 
+    if network.config.history_map.memory:
+        # Wrong poses are for the tracks of this frame; what is remembered of them lies where it was seen.
+        motion = relative_motion(frame.inputs.ego_to_global, past.state.ego_to_global)
+        outputs = replace(outputs, warped_history=network.history_memory.align(past.state.history_maps, motion))
     state = network.advance(past.state, outputs, instances, frame.inputs)
     return Past(
         state=state,
