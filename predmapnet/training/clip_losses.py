@@ -25,9 +25,8 @@ from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.clip_settings import ClipSettings, ClipStage
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss
 from predmapnet.training.data.targets import Targets
-from predmapnet.training.losses.lite import focal_loss, forecast_loss, mask_loss, masks_of_size
+from predmapnet.training.losses.lite import forecast_loss, mask_loss, masks_of_size
 from predmapnet.training.losses.maptracker import (
-    CLASS_WEIGHT,
     LayerTargets,
     all_orders,
     assign,
@@ -206,17 +205,21 @@ def _vector_terms(
         _add(terms, {"focal": focal, "points": distance})
     rows = outputs.row_valid.shape[1]
     pairs = Assignment(assigned.rows // rows, assigned.rows % rows, assigned.truth)
+    of_detections = _from_row(pairs, past.owners.kinds.shape[1])
     for layer in outputs.layers:
         if layer.masks is not None:
+            # Layers of the generator refine detections only: a track has one mask, in the last layer.
+            answering = pairs if layer is outputs.layers[-1] else of_detections
             masks = masks_of_size(targets.masks, layer.masks)
-            loss = mask_loss(layer.masks, masks, pairs, settings.mask_dice, settings.mask_entropy)
-            _add(terms, {"mask": loss})
-        if layer.points is None and layer.logits is not None:
-            # A query that was not decoded yet cannot know which elements tracks have taken: background is not asked.
-            found = layer.logits[pairs.frame, pairs.row]
-            wanted = functional.one_hot(targets.kinds[pairs.truth], found.shape[-1]).to(found.dtype)
-            _add(terms, {"generator": CLASS_WEIGHT * focal_loss(found, wanted).sum() / max(len(pairs), 1)})
+            loss = mask_loss(layer.masks, masks, answering, settings.mask_dice, settings.mask_entropy)
+            _add(terms, {"mask": loss * len(answering) / max(len(pairs), 1)})
     return terms, assigned
+
+
+def _from_row(pairs: Assignment, first: int) -> Assignment:
+    """Return the pairs of row ``first`` and later ones."""
+    kept = pairs.row >= first
+    return Assignment(pairs.frame[kept], pairs.row[kept], pairs.truth[kept])
 
 
 def _continued(outputs: FrameOutputs, targets: Targets, past: Past, network: PredMapNet) -> Tensor:

@@ -184,3 +184,17 @@ def test_a_track_knows_its_class_and_the_network_tells_it(size):
         found.append(decode(network, levels, pose(1.0), labelled).queries[:, :3])
     for one, other in ((0, 1), (1, 2), (0, 2)):
         assert (found[one] - found[other]).abs().max() > 1e-3
+
+
+@torch.no_grad()
+def test_the_memory_keeps_the_masks_of_the_generator_or_those_of_the_decoder(size):
+    """M_L of the paper is of Q^SA_L, which the decoder is given; ``lite`` has learned with what it returns."""
+    network = tiny_network(size)
+    levels = bev_levels(network.config)
+    outputs = decode(network, levels, pose())
+    features = network.mask_head.mask_features(levels)
+    generated = network.query_generator(levels[::-1], features, network.mask_head)
+    decoded = network.mask_head(outputs.queries, features)
+    expected = generated.masks[-1] if size == "paper" else decoded
+    torch.testing.assert_close(keep(outputs, [2, 5], [0, 1]).masks, expected[:, [2, 5]].sigmoid(), atol=1e-5, rtol=1e-4)
+    assert (generated.masks[-1] - decoded).abs().max() > 1e-2

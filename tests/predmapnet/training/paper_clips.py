@@ -77,7 +77,7 @@ def _built(text: str) -> Watched:
 
 @torch.no_grad()
 def say(network: PredMapNet, line: np.ndarray, score: float) -> None:
-    """Let every row of every decoder layer say the same line ``(20, 2)``, metres, with the same score in all classes."""
+    """Let every row of every decoder layer say one line ``(20, 2)``, metres, with one score in all classes."""
     decoder, size = network.map_decoder, np.array([network.config.roi_length, network.config.roi_width])
     last = decoder.line[-1]
     last.weight.zero_()

@@ -14,7 +14,6 @@ from tests.predmapnet.training.paper_clips import (
     BOUNDARY,
     CALM,
     DIVIDER,
-    JOINT,
     clip_network,
     clip_of,
     forecast_steps,
@@ -278,5 +277,3 @@ def test_each_module_learns_from_the_losses_that_it_is_meant_to_learn_from():
     assert any(part.startswith("propagation.motion") for part in reached(network, terms["transformation"]))
     forecast = reached(network, terms["forecast"])
     assert forecast and all(part.startswith("future_guidance.offsets") for part in forecast)
-
-
