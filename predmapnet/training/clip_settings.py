@@ -44,7 +44,7 @@ class ClipStage:
 
     Attributes:
         name: of the stage.
-        epochs: of MapTracker on the old nuScenes split; they share out the time of a run.
+        epochs: of the paper on nuScenes (Sec. 4.1); they share out the time of a run.
         vectors: polylines, tracks and all of the paper's modules; otherwise segmentation and depth only.
         images: frames of a clip whose images are trained on; the others go through the image backbone without
             gradient, to save memory.
@@ -72,7 +72,7 @@ class ClipStage:
 SLOW_IMAGES = {"image_backbone.resnet": 0.1}
 CLIP_STAGES = (
     ClipStage("bev", 18, vectors=False, images="first and last", rates=SLOW_IMAGES),
-    ClipStage("warmup", 4, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
+    ClipStage("warmup", 6, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
     ClipStage(
         "joint",
         48,

@@ -196,6 +196,7 @@ class Trainer:
         position = self.position
         if position.stage == stage.name and self._stored is not None:
             stage.begin()
+            self.average.decay = settings.average_decay
             optimiser = make_optimiser(self.network, settings)
             tensors = checkpoint.read(self._stored, "network")
             checkpoint.restore_optimiser(optimiser, checkpoint.below_prefix("optimiser", tensors))

@@ -65,11 +65,13 @@ CLIP_OPTIMISER = OptimiserSettings(
     learning_rate=5e-4,
     betas=(0.9, 0.999),
     weight_decay=0.01,
+    decay_all=True,
     warmup_steps=500,
     warmup_start=1 / 3,
     clip_norm=35.0,
+    average_decay=0.0,
 )
-"""MapTracker's; rates and the end come from the stage."""
+"""MapTracker's, which averages no weights; rates and the end come from the stage."""
 SINGLE_SHARE = 2 / 3
 """Of the time of a lite run, for its single-frame stage."""
 
