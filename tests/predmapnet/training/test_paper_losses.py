@@ -151,8 +151,10 @@ def test_lines_count_fifty_in_every_layer_and_frame():
     assert float(losses(network, clip_of(network, instants))["points"]) == pytest.approx(expected, rel=1e-3)
 
 
-def test_a_track_answers_for_its_element_and_detections_for_newborn_ones():
-    """In the second frame the track of the divider lies on the newborn boundary, and yet is not asked for it."""
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(("own", "new"), [(-9.0, 3.0), (3.0, -9.0)])
+def test_a_track_answers_for_its_element_and_detections_for_newborn_ones(own, new, order):
+    """Whichever of the divider that it stands for and a newborn boundary lies where it says."""
     network = clip_network()
     say(network, line(3.0), 0.5)
     network.map_decoder.classify.bias.requires_grad_(False)
@@ -164,12 +166,12 @@ def test_a_track_answers_for_its_element_and_detections_for_newborn_ones():
         seen.append(logits)
 
     network.map_decoder.register_forward_hook(watch)
-    instants = [[(DIVIDER, 4, line(3.0))], [(DIVIDER, 4, line(-9.0)), (BOUNDARY, 7, line(3.0))]]
+    instants = [[(DIVIDER, 4, line(3.0))], [(DIVIDER, 4, line(own)), (BOUNDARY, 7, line(new))][::order]]
     losses(network, clip_of(network, instants))["focal"].backward()
     wanted = [(logits.grad[0] < 0).nonzero().tolist() for logits in seen]
     ((owner, kind),) = wanted[0]
     assert kind == DIVIDER
-    (track, its_kind), (detection, new_kind) = wanted[1]
+    (track, its_kind), (detection, new_kind) = sorted(wanted[1])
     assert (track, its_kind, new_kind) == (owner, DIVIDER, BOUNDARY) and detection >= DETECTIONS
 
 
