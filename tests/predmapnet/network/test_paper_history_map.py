@@ -131,7 +131,7 @@ def guidance_case(size, **sections):
     generator = torch.Generator().manual_seed(1)
     queries = torch.randn(1, 3, config.decoder.width, generator=generator)
     maps = torch.rand(1, 3, *config.mask_size, generator=generator)
-    maps[:, 2] = 0.4  # Nowhere sure enough.
+    maps[:, 2] = 0.5  # Nowhere above theta.
     return guidance, queries, torch.tensor([[0, 2, 1]]), maps, bev_levels(config)[mask_level(config)]
 
 

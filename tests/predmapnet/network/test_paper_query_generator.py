@@ -31,7 +31,7 @@ def paint_masks(head, config):
     head.embedding[-1].bias.data[0] = 1.0
     rows, columns = config.mask_size
     features = torch.zeros(1, config.masks.channels, rows, columns)
-    features[:, 0] = -5.0
+    features[:, 0] = 0.0  # A probability of tau_L, and not above it.
     features[:, 0, 1:5, 2:9] = 5.0
     return features
 

@@ -27,12 +27,7 @@ DETECTIONS, DECODER_LAYERS, MASK_LAYERS = 12, 2, 3 + 1
 SIDEWAYS = 1.5
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def drifting(frames=3):
