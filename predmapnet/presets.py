@@ -66,7 +66,7 @@ def _paper(name: str, baseline: PredMapNetConfig) -> PredMapNetConfig:
     changes = {
         "name": name,
         "semantic_queries": SemanticQueriesConfig(layers=3),
-        "history_map": HistoryMapConfig(),
+        "history_map": HistoryMapConfig(masks="generated"),
         "future": FutureConfig(hidden=512),
         "tracking": baseline.tracking.model_copy(update={"tau_d": 0.4, "first_tau_d": None}),
         "depth": DepthConfig(enabled=True, bins=68, far=35.0),

@@ -34,6 +34,9 @@ class HistoryMapConfig(Section):
     beta: Fraction = 0.9
     threshold: Fraction = 0.5
     """theta of Sec. 3.4."""
+    masks: Literal["decoded", "generated"] = "decoded"
+    """Masks that are remembered: of the queries as the map decoder is given them (``generated``, M_L of the paper) or
+    as it returns them."""
 
     @model_validator(mode="after")
     def _guidance_needs_memory(self) -> Self:

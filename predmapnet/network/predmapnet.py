@@ -221,7 +221,8 @@ class PredMapNet(nn.Module):
         layers = self._generator_layers(detections, tracks, mask_features)
         layers += [LayerPredictions(logits, points, None) for logits, points in refined]
         if self.mask_head is not None and mask_features is not None:
-            layers[-1].masks = self.mask_head(embedding, mask_features)
+            decoded = self.config.history_map.masks == "decoded"
+            layers[-1].masks = self.mask_head(embedding if decoded else start.queries, mask_features)
         no_id = state.instances.track_ids.new_full(detections.queries.shape[:2], -1)
         return FrameOutputs(
             layers=layers,
@@ -268,16 +269,18 @@ class PredMapNet(nn.Module):
     ) -> list[LayerPredictions]:
         """Predictions of the query generator; track rows say the same in all of them, the decoder's input."""
         points = None if self.map_decoder.learns_start else torch.cat([tracks.points, detections.points], dim=1)
-        if not detections.logits:
+        if not detections.masks:
             return [] if points is None else [LayerPredictions(None, points, None)]
         assert mask_features is not None and self.mask_head is not None
-        track_logits = self.query_generator.classify(tracks.queries)
         track_masks = self.mask_head(tracks.queries, mask_features)
-        layers = [
-            LayerPredictions(torch.cat([track_logits, logits], dim=1), None, torch.cat([track_masks, masks], dim=1))
-            for logits, masks in zip(detections.logits, detections.masks, strict=True)
-        ]
+        layers = [LayerPredictions(None, None, torch.cat([track_masks, masks], dim=1)) for masks in detections.masks]
+        if self.query_generator.classify is not None:
+            track_logits = self.query_generator.classify(tracks.queries)
+            for layer, logits in zip(layers, detections.logits, strict=True):
+                layer.logits = torch.cat([track_logits, logits], dim=1)
         layers[-1].points = points
+        if self.config.history_map.masks == "generated":
+            layers[-1].masks = None  # They are those of the result, and are not said twice.
         return layers
 
     def advance(

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from predmapnet.config import EncoderBevMemoryConfig
 from predmapnet.errors import UserError
-from predmapnet.network.ego_motion import relative_pose
+from predmapnet.network.ego_motion import relative_motion, relative_pose
 from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
@@ -24,9 +24,8 @@ from predmapnet.network.track_propagation import PoseTrackPropagation
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss
 from predmapnet.training.data.targets import Targets
-from predmapnet.training.losses.lite import focal_loss, forecast_loss, mask_loss, masks_of_size
+from predmapnet.training.losses.lite import forecast_loss, mask_loss, masks_of_size
 from predmapnet.training.losses.maptracker import (
-    CLASS_WEIGHT,
     LayerTargets,
     all_orders,
     assign_layer,
@@ -204,17 +203,21 @@ def _vector_terms(
         _add(terms, {"focal": focal, "points": distance})
     rows = outputs.query_valid.shape[1]
     pairs = Assignment(assigned.rows // rows, assigned.rows % rows, assigned.truth)
+    of_detections = _from_row(pairs, past.track_truth.kinds.shape[1])
     for layer in outputs.layers:
         if layer.masks is not None:
+            # Layers of the generator refine detections only: a track has one mask, in the last layer.
+            answering = pairs if layer is outputs.layers[-1] else of_detections
             masks = masks_of_size(targets.masks, layer.masks)
-            loss = mask_loss(layer.masks, masks, pairs, settings.mask_dice, settings.mask_entropy)
-            _add(terms, {"mask": loss})
-        if layer.points is None and layer.logits is not None:
-            # A query that was not decoded yet cannot know which elements tracks have taken: background is not asked.
-            found = layer.logits[pairs.frame, pairs.row]
-            wanted = functional.one_hot(targets.kinds[pairs.truth], found.shape[-1]).to(found.dtype)
-            _add(terms, {"generator": CLASS_WEIGHT * focal_loss(found, wanted).sum() / max(len(pairs), 1)})
+            loss = mask_loss(layer.masks, masks, answering, settings.mask_dice, settings.mask_entropy)
+            _add(terms, {"mask": loss * len(answering) / max(len(pairs), 1)})
     return terms, assigned
+
+
+def _from_row(pairs: Assignment, first: int) -> Assignment:
+    """Return the pairs of row ``first`` and later ones."""
+    kept = pairs.row >= first
+    return Assignment(pairs.frame[kept], pairs.row[kept], pairs.truth[kept])
 
 
 def _continued(outputs: FrameOutputs, targets: Targets, past: Past, network: PredMapNet) -> Tensor:
@@ -294,6 +297,10 @@ def _next_tracks(
         # One more entry stands for "none", so that -1 can be looked up.
         return functional.pad(values, (0, 1), value=-1)[truth]
 
+    if network.config.history_map.memory:
+        # Wrong poses are for the tracks of this frame; what is remembered of them lies where it was seen.
+        motion = relative_motion(frame.inputs.ego_to_global, past.state.ego_to_global)
+        outputs = replace(outputs, warped_history=network.history_memory.align(past.state.history_maps, motion))
     state = network.advance(past.state, outputs, instances, frame.inputs)
     return Past(
         state=state,

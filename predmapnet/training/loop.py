@@ -200,6 +200,7 @@ class Trainer:
         position = self.position
         if position.stage == stage.name and self._stored is not None:
             stage.begin()
+            self.average.decay = settings.average_decay
             optimiser = make_optimiser(self.network, settings)
             tensors = run_checkpoint.read(self._stored, "network")
             run_checkpoint.restore_optimiser(optimiser, run_checkpoint.below_prefix("optimiser", tensors))

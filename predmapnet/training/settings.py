@@ -99,7 +99,7 @@ class ClipStage:
 
     Attributes:
         name: of the stage.
-        epochs: of MapTracker on the old nuScenes split; they share out the time of a run.
+        epochs: of the paper on nuScenes (Sec. 4.1); they share out the time of a run.
         vectors: polylines, tracks and all of the paper's modules; otherwise segmentation and depth only.
         images: frames of a clip whose images are trained on; the others go through the image backbone without
             gradient, to save memory.
@@ -127,7 +127,7 @@ class ClipStage:
 SLOW_IMAGES = {"image_backbone.resnet": 0.1}
 CLIP_STAGES = (
     ClipStage("bev", 18, vectors=False, images="first and last", rates=SLOW_IMAGES),
-    ClipStage("warmup", 4, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
+    ClipStage("warmup", 6, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
     ClipStage(
         "joint",
         48,
@@ -140,11 +140,13 @@ CLIP_OPTIMISER = OptimiserSettings(
     learning_rate=5e-4,
     betas=(0.9, 0.999),
     weight_decay=0.01,
+    decay_all=True,
     warmup_steps=500,
     warmup_start=1 / 3,
     clip_norm=35.0,
+    average_decay=0.0,
 )
-"""MapTracker's; rates and the end come from the stage."""
+"""MapTracker's, which averages no weights; rates and the end come from the stage."""
 SINGLE_SHARE = 2 / 3
 """Of the time of a lite run, for its single-frame stage."""
 

@@ -1,6 +1,6 @@
 """A network small enough for tests, and streams of random frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
@@ -20,6 +20,15 @@ SMALL = {
     "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
     "future": {"hidden": 32},
 }
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Tiny tensors are not worth a second thread, and wait for it long where the cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ def test_joint_training_reaches_every_parameter_and_learns(clip):
         optimiser.step()
         totals.append(float(total.detach()))
     assert {name for name, p in network.named_parameters() if p.grad is None} == set()
-    expected = {"segmentation", "segmentation_dice", "focal", "points", "mask", "generator", "depth"}
+    expected = {"segmentation", "segmentation_dice", "focal", "points", "mask", "depth"}
     assert set(terms) == expected | {"transformation", "forecast"}
     assert all(torch.isfinite(term) for term in terms.values())
     assert totals[-1] < totals[0]

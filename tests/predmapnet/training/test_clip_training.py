@@ -63,8 +63,8 @@ def test_clips_end_with_their_frame_and_repeat_for_a_seed(scenes):
 
 
 def test_a_plan_shares_out_the_time_and_refuses_stages_of_other_networks():
-    shares = [budget for _, budget in plan_run(CONFIG, "all", 70.0, None).clip_stages]
-    assert shares == [Budget(18.0), Budget(4.0), Budget(48.0)]
+    shares = [budget for _, budget in plan_run(CONFIG, "all", 72.0, None).clip_stages]
+    assert shares == [Budget(18.0), Budget(6.0), Budget(48.0)]
     assert [stage.name for stage, _ in plan_run(CONFIG, "joint", 70.0, 3).clip_stages] == ["joint"]
     lite = plan_run(preset("lite"), "all", 60.0, None)
     assert (lite.single, lite.temporal, lite.clip_stages) == (Budget(40.0), Budget(pytest.approx(20.0)), ())
