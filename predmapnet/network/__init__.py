@@ -5,7 +5,7 @@ MapTracker's:
 
 - image features: :mod:`.small.backbone`, or :mod:`.maptracker.resnet`; :mod:`.depth_head` in training
 - BEV encoder: :mod:`.small.bev_encoder` on the look-up of :mod:`.small.ground_lookup`, or :mod:`.maptracker.bevformer`
-  at the points of :mod:`.maptracker.reference_points`
+  on :mod:`.maptracker.reference_points`; both find the ground from the :mod:`.calibration` of each frame
 - past BEV maps: :mod:`.small.residual_bev_memory`, or :mod:`.maptracker.bev_memory`
 - semantic segmentation of the ground: :mod:`.segmentation_head`
 - Semantic-Aware Query Generator: :mod:`.semantic_queries`, with :mod:`.instance_masks` and :mod:`.bev_pyramid`

@@ -106,4 +106,4 @@ def test_without_truth_there_is_only_background(clip):
 
 def test_a_network_without_tracks_of_this_kind_is_refused(clip):
     with pytest.raises(UserError, match="lite does not train in clips"):
-        clip_losses(PredMapNet(preset("lite")), None, clip[0], JOINT, CALM, 0, torch.Generator())
+        clip_losses(PredMapNet(preset("lite")), clip, JOINT, CALM, 0, torch.Generator())
