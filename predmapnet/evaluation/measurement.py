@@ -6,21 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mapfusion.arrays import Integer
 from mapfusion.elements import GlobalMap
 from predmapnet.errors import UserError
+from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
 from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
 from predmapnet.evaluation.consistency_ap import Flags, consistency_flags, matched_tracks, with_formed_tracks
 from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.frechet_ap import FRECHET_THRESHOLDS, frechet_flags
 from predmapnet.evaluation.global_map import GlobalMapQuality, global_map_quality, pool, seen_area
+from predmapnet.evaluation.global_map_ap import global_map_matches
 from predmapnet.evaluation.identity import IdentityCounts, count_identities, pool_identities
-from predmapnet.evaluation.precision_recall import AveragePrecision
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate_matches
 from predmapnet.evaluation.raster_ap import (
     RasterAveragePrecision,
     RasterMatches,
     raster_from_matches,
     raster_matches,
 )
+from predmapnet.evaluation.stability import Protocol, Stability, scene_instances, stability
+from predmapnet.evaluation.stability_matching import SceneInstances
 from predmapnet.evaluation.tracks import truth_track_ids
 
 
@@ -32,19 +38,25 @@ class SceneMeasurement:
         frames: the frames that were measured, in order.
         thresholds: chamfer thresholds, metres.
         chamfer: per frame true-positive flags.
+        frechet: the same by the order-aware distance.
+        ahead, rear: per frame the matches of each half of the region.
         raster: per frame matches by overlap.
         tracked, tracked_unanchored: per frame flags of C-mAP with the ids that the predictions carry, and the same
             without asking for consistency.
         formed_frames, formed: frames with ids formed from the predictions, and their flags.
         identity: id switches and track lengths.
         forecast: errors of the forecasts.
-        global_map: None where there is no global map or no true one.
+        protocol, instances: of the stability.
+        global_map, global_matches: None where there is no global map or no true one.
         mapping_seconds: wall time of mapping; None where results were read.
     """
 
     frames: tuple[EvaluationFrame, ...]
     thresholds: tuple[float, ...]
     chamfer: list[Flags]
+    frechet: list[Flags]
+    ahead: list[Matches]
+    rear: list[Matches]
     raster: list[tuple[RasterMatches, ...]]
     tracked: list[Flags]
     tracked_unanchored: list[Flags]
@@ -52,7 +64,10 @@ class SceneMeasurement:
     formed: list[Flags]
     identity: IdentityCounts
     forecast: ForecastErrors
+    protocol: Protocol
+    instances: SceneInstances
     global_map: GlobalMapQuality | None
+    global_matches: Matches | None
     mapping_seconds: float | None = None
 
 
@@ -63,13 +78,18 @@ class Measurement:
     scenes: tuple[str, ...]
     frames: tuple[EvaluationFrame, ...]
     chamfer: AveragePrecision
+    frechet: AveragePrecision
+    ahead: AveragePrecision
+    rear: AveragePrecision
     raster: RasterAveragePrecision
     consistency: AveragePrecision
     consistency_unanchored: AveragePrecision
     formed_consistency: AveragePrecision
     identity: IdentityCounts
     forecast: ForecastErrors
+    stability: Stability
     global_map: GlobalMapQuality | None
+    global_map_ap: AveragePrecision | None
     frames_per_second: float | None
 
     @property
@@ -94,10 +114,15 @@ class Measurement:
             "frames": len(self.frames),
             "frames_per_second": self.frames_per_second,
             "chamfer_ap": self.chamfer.figures(),
+            "ahead_ap": self.ahead.figures(),
+            "rear_ap": self.rear.figures(),
+            "frechet_ap": self.frechet.figures(),
             "consistency_ap": consistency,
             "consistency_ap_formed_ids": formed,
             "raster_ap": self.raster.figures(),
+            "stability": self.stability.figures(),
             "global_map": None if self.global_map is None else self.global_map.figures(),
+            "global_map_ap": None if self.global_map_ap is None else self.global_map_ap.figures(),
             "forecast": self.forecast.figures(),
             "tracks": self.identity.figures(),
         }
@@ -108,6 +133,7 @@ def measure_scene(
     global_map: GlobalMap | None = None,
     truth_map: GlobalMap | None = None,
     mapping_seconds: float | None = None,
+    protocol: Protocol = Protocol.ANCHORED,
 ) -> SceneMeasurement:
     """Measure one scene.
 
@@ -115,6 +141,7 @@ def measure_scene(
         frames: all frames of the scene in order.
         global_map, truth_map: maps of the whole drive in the same global frame, if both exist.
         mapping_seconds: wall time that mapping took, carried along.
+        protocol: of the stability.
 
     Raises:
         UserError: the scene has no frame.
@@ -126,14 +153,18 @@ def measure_scene(
     truth_ids = truth_track_ids(frames)
     matched = matched_tracks(frames, truth_ids, thresholds)
     formed_frames = with_formed_tracks(frames)
-    quality = None
+    quality = global_matches = None
     if global_map is not None and truth_map is not None:
         seen = seen_area([frame.predicted.ego_to_global for frame in frames], roi)
         quality = global_map_quality(global_map, truth_map, seen)
+        global_matches = global_map_matches(global_map, truth_map, seen, thresholds)
     return SceneMeasurement(
         frames=tuple(frames),
         thresholds=thresholds,
         chamfer=[frame_flags(frame, thresholds) for frame in frames],
+        frechet=[frechet_flags(frame) for frame in frames],
+        ahead=[half_matches(frame, Half.AHEAD, thresholds) for frame in frames],
+        rear=[half_matches(frame, Half.REAR, thresholds) for frame in frames],
         raster=[raster_matches(frame) for frame in frames],
         tracked=consistency_flags(frames, matched),
         tracked_unanchored=consistency_flags(frames, matched, anchored=False),
@@ -141,7 +172,10 @@ def measure_scene(
         formed=consistency_flags(formed_frames, matched_tracks(formed_frames, truth_ids, thresholds)),
         identity=count_identities(frames, truth_ids, [found[:, -1] for found in matched]),
         forecast=forecast_errors(frames),
+        protocol=protocol,
+        instances=scene_instances(frames, _element_ids(frames, truth_ids), protocol),
         global_map=quality,
+        global_matches=global_matches,
         mapping_seconds=mapping_seconds,
     )
 
@@ -159,11 +193,15 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
     thresholds = scenes[0].thresholds
     frames = [frame for scene in scenes for frame in scene.frames]
     maps = [scene.global_map for scene in scenes if scene.global_map is not None]
+    matches = [scene.global_matches for scene in scenes if scene.global_matches is not None]
     seconds = [scene.mapping_seconds for scene in scenes if scene.mapping_seconds is not None]
     return Measurement(
         scenes=tuple(scene.frames[0].scene for scene in scenes),
         frames=tuple(frames),
         chamfer=chamfer_from_flags(frames, _flat([scene.chamfer for scene in scenes]), thresholds),
+        frechet=chamfer_from_flags(frames, _flat([scene.frechet for scene in scenes]), FRECHET_THRESHOLDS),
+        ahead=accumulate_matches([match for scene in scenes for match in scene.ahead], thresholds),
+        rear=accumulate_matches([match for scene in scenes for match in scene.rear], thresholds),
         raster=raster_from_matches([match for scene in scenes for match in scene.raster]),
         consistency=chamfer_from_flags(frames, _flat([scene.tracked for scene in scenes]), thresholds),
         consistency_unanchored=chamfer_from_flags(
@@ -176,10 +214,18 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
         ),
         identity=pool_identities([scene.identity for scene in scenes]),
         forecast=pool_forecasts([scene.forecast for scene in scenes]),
+        stability=stability([(scene.frames, scene.instances) for scene in scenes], scenes[0].protocol),
         global_map=pool(maps) if len(maps) == len(scenes) else None,
+        global_map_ap=accumulate_matches(matches, thresholds) if len(matches) == len(scenes) else None,
         frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
     )
 
 
 def _flat(flags: Sequence[list[Flags]]) -> list[Flags]:
     return [entry for scene in flags for entry in scene]
+
+
+def _element_ids(frames: Sequence[EvaluationFrame], track_ids: Sequence[Integer]) -> list[Integer]:
+    """Return which elements of the source's map the truths are; their track ids where the source cannot tell."""
+    known = all((frame.truth.element_ids >= 0).all() for frame in frames)
+    return [frame.truth.element_ids for frame in frames] if known else list(track_ids)
