@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from mapfusion.arrays import Integer
-from mapfusion.elements import GlobalMap
+from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.errors import UserError
 from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
 from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
@@ -25,8 +25,9 @@ from predmapnet.evaluation.raster_ap import (
     raster_from_matches,
     raster_matches,
 )
-from predmapnet.evaluation.stability import Protocol, Stability, scene_instances, stability
+from predmapnet.evaluation.stability import Stability, scene_instances, stability
 from predmapnet.evaluation.stability_matching import SceneInstances
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.evaluation.tracks import truth_track_ids
 
 
@@ -49,6 +50,8 @@ class SceneMeasurement:
         protocol, instances: of the stability.
         global_map, global_matches: None where there is no global map or no true one.
         mapping_seconds: wall time of mapping; None where results were read.
+        absent_frames: frames that the results lack, measured as empty ones.
+        weights_sha256: of the weights that made the maps; None where unknown.
     """
 
     frames: tuple[EvaluationFrame, ...]
@@ -69,6 +72,8 @@ class SceneMeasurement:
     global_map: GlobalMapQuality | None
     global_matches: Matches | None
     mapping_seconds: float | None = None
+    absent_frames: int = 0
+    weights_sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -91,11 +96,36 @@ class Measurement:
     global_map: GlobalMapQuality | None
     global_map_ap: AveragePrecision | None
     frames_per_second: float | None
+    absent_frames: int
+    weights_sha256: str | None
 
     @property
     def has_tracks(self) -> bool:
         """Whether any prediction carries a track id."""
         return any((frame.predicted.track_ids >= 0).any() for frame in self.frames)
+
+    @property
+    def roi(self) -> RegionOfInterest:
+        """The region in which everything was measured."""
+        return self.frames[0].predicted.roi
+
+    def missing(self) -> list[str]:
+        """Return what the figures lack, as sentences for the reader."""
+        found = []
+        if self.absent_frames:
+            found.append(f"{self.absent_frames} of {len(self.frames)} frames are not in the results and count as empty")
+        absent = [kind.kind.label for kind in self.chamfer.kinds if not kind.truths]
+        if absent:
+            found.append(
+                f"no ground truth of {', '.join(absent)}: counts as 0 in every mean over the kinds but raster's"
+            )
+        if not self.has_tracks:
+            found.append("no track ids: consistency AP is of ids formed afterwards, and there is no map of the drive")
+        elif self.global_map is None:
+            found.append("no map of the drive for some scenes: they have no tracked element or no true map")
+        if not len(self.forecast.errors[0]):
+            found.append("no forecasts")
+        return found
 
     def figures(self) -> dict[str, Any]:
         """Nested figures as written to JSON: ``chamfer_ap.mAP``, ``global_map.f1@1.0`` and so on.
@@ -184,12 +214,14 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
     """Pool scenes; their order breaks ties of scores.
 
     Raises:
-        UserError: there is no scene, or the scenes were mapped with different regions of interest.
+        UserError: there is no scene, or the scenes were mapped with different regions of interest or weights.
     """
     if not scenes:
         raise UserError("There is no scene to measure.")
     if len({scene.thresholds for scene in scenes}) > 1:
         raise UserError("The scenes have regions of interest of different sizes; measure them apart.")
+    if len({scene.weights_sha256 for scene in scenes}) > 1:
+        raise UserError("The scenes were mapped with different weights; measure each method apart.")
     thresholds = scenes[0].thresholds
     frames = [frame for scene in scenes for frame in scene.frames]
     maps = [scene.global_map for scene in scenes if scene.global_map is not None]
@@ -218,6 +250,8 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
         global_map=pool(maps) if len(maps) == len(scenes) else None,
         global_map_ap=accumulate_matches(matches, thresholds) if len(matches) == len(scenes) else None,
         frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
+        absent_frames=sum(scene.absent_frames for scene in scenes),
+        weights_sha256=scenes[0].weights_sha256,
     )
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +31,7 @@ from predmapnet.evaluation.stability_matching import (
     padded_lines,
     paired_instances,
 )
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.evaluation.stability_values import localisation_and_shape, presence
 
 INTERVAL = 2
@@ -40,18 +40,6 @@ LOCALISATION_WEIGHT = 0.5
 UNDETECTED = np.float32(0.01)
 """Instances whose scores are below this in both frames do not count."""
 VALUES = ("presence", "localisation", "shape", "stability")
-
-
-class Protocol(StrEnum):
-    """Protocols of the stability metric.
-
-    ``ANCHORED`` has instances of the ground truth, all of them, each with its own poses. ``PUBLISHED_ANCHORED`` is the
-    same with the toolbox's defect, ``PUBLISHED_PAIRED`` the toolbox's protocol without ground truth.
-    """
-
-    ANCHORED = "anchored"
-    PUBLISHED_ANCHORED = "published-anchored"
-    PUBLISHED_PAIRED = "published-paired"
 
 
 @dataclass(frozen=True)

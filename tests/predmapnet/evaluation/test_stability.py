@@ -10,8 +10,9 @@ import pytest
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.evaluation.chamfer_distance import resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
-from predmapnet.evaluation.stability import Protocol, scene_instances, stability
+from predmapnet.evaluation.stability import scene_instances, stability
 from predmapnet.evaluation.stability_matching import MATCHING_POINTS, matching_costs
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.evaluation.stability_values import heights, localisation_and_shape, presence, stations_of
 from predmapnet.scenes import FrameTruth
 from tests.predmapnet.evaluation.metric_fixtures import REFERENCE, load_metric_case
