@@ -75,8 +75,9 @@ def evaluate(
     stability: Annotated[
         Protocol,
         typer.Option(
-            help="Instances of the stability: of the ground truth (anchored), the same with the public toolbox's "
-            "defect (published-anchored), or pairs of predictions (published-paired)."
+            metavar="PROTOCOL",
+            help="Protocol of the stability: anchored (elements of the ground truth), published-anchored (the same "
+            "with the public toolbox's defect) or published-paired (pairs of predictions).",
         ),
     ] = Protocol.ANCHORED,
     dataset: Dataset = None,
@@ -123,7 +124,8 @@ def evaluate(
     err.print(sentence, markup=False)
     scenes = scenes_to_measure(settings, source, split)
     found_split, in_split = split_of(source.scenes(), scenes)
-    warnings = warnings_of(source.name, split_scheme.value, found_split, len(scenes), in_split)
+    world = "demo" if source.synthetic else source.name
+    warnings = warnings_of(world, split_scheme.value, found_split, len(scenes), in_split)
     measured = []
     with progress_display() as display:
         display.scenes(0, len(scenes))

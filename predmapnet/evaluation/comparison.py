@@ -201,7 +201,7 @@ def _check_same(paths: Sequence[Path], evaluations: Sequence[Mapping[str, Any]])
 
 
 def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
-    notes = [] if scenes >= FEW_SCENES else [f"{scenes} scenes are few: the intervals are narrower than the truth"]
+    notes = [] if scenes >= FEW_SCENES else [f"{_scenes(scenes)} only: the intervals are narrower than the truth"]
     if not _same_stability(evaluations):
         notes.append("the stability was measured by different protocols and is left out")
     if len({content.get("consistency_ap", {}).get("ids") for content in evaluations}) > 1:
@@ -210,6 +210,10 @@ def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
     for content in evaluations:
         shared |= dict.fromkeys(content["evaluated"].get("warnings", []))
     return [*notes, *shared]
+
+
+def _scenes(count: int) -> str:
+    return "1 scene" if count == 1 else f"{count} scenes"
 
 
 def _same_stability(evaluations: Sequence[Mapping[str, Any]]) -> bool:

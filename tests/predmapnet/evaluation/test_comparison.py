@@ -44,7 +44,7 @@ def test_a_gain_in_every_scene_is_clear_however_much_scenes_differ(write):
     found = compare(write(a=evaluation(scenes), b=evaluation(scenes + 0.01)))
     base, better = found.figures["chamfer_mAP"]
     assert base.difference is None and base.scenes.mean == pytest.approx(0.5)
-    assert better.difference.mean == better.difference.low == pytest.approx(0.01)
+    assert better.difference.mean == pytest.approx(0.01) and better.difference.low == pytest.approx(0.01)
     assert better.difference.high == pytest.approx(0.01) and better.clear
     assert base.scenes.high - base.scenes.low > 0.1, "the interval of the mean is that of the scenes"
 
@@ -80,7 +80,7 @@ def test_scenes_without_a_figure_are_left_out_for_all_methods(write):
 
 
 def test_few_scenes_are_named(write):
-    assert "3 scenes are few" in compare(write(a=evaluation([0.1] * 3), b=evaluation([0.2] * 3))).notes[0]
+    assert "3 scenes only" in compare(write(a=evaluation([0.1] * 3), b=evaluation([0.2] * 3))).notes[0]
 
 
 @pytest.mark.parametrize(
