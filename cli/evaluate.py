@@ -76,17 +76,17 @@ def evaluate(
         Protocol,
         typer.Option(
             metavar="PROTOCOL",
-            help="Protocol of the stability: anchored (elements of the ground truth), published-anchored (the same "
-            "with the public toolbox's defect) or published-paired (pairs of predictions).",
+            help="Protocol of the stability: anchored (elements of the ground truth), published (the same with the "
+            "public toolbox's defect) or paired (pairs of predictions).",
         ),
     ] = Protocol.ANCHORED,
     dataset: Dataset = None,
     data_root: DataRoot = None,
     split_scheme: SplitScheme = Scheme.OLD,
     official_frames: OfficialFrames = False,
-    truth_cache: Annotated[
-        bool, typer.Option("--truth-cache/--no-truth-cache", help="Cache the ground truth on disk.")
-    ] = True,
+    no_truth_cache: Annotated[
+        bool, typer.Option("--no-truth-cache", help="Compute the ground truth anew, without a cache on disk.")
+    ] = False,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
@@ -118,7 +118,7 @@ def evaluate(
         roi=_region(results, roi),
         protocol=stability,
         threads=threads,
-        cache=default_cache() / "ground-truth" if truth_cache else None,
+        cache=None if no_truth_cache else default_cache() / "ground-truth",
     )
     source, sentence = settings.open()
     err.print(sentence, markup=False)

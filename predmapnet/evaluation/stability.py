@@ -106,7 +106,7 @@ def scene_instances(
         protocol: see :class:`Protocol`.
         interval: frames from the previous to the current one.
     """
-    if protocol is Protocol.PUBLISHED_PAIRED:
+    if protocol is Protocol.PAIRED:
         return paired_instances(frames, interval)
     return anchored_instances(frames, truth_ids, interval)
 
@@ -132,7 +132,7 @@ def stability(
     own, poses_of = np.concatenate([none, *own_pairs]), np.concatenate([none, *own_pairs])
     rows = np.concatenate([none, *(found.predictions for _, found in scenes)])
     kinds = np.concatenate([none[:, 0], *(found.kinds for _, found in scenes)])
-    if protocol is Protocol.PUBLISHED_ANCHORED:
+    if protocol is Protocol.PUBLISHED:
         # The defect: as many instances as there are pairs, and instance k gets the poses of pair k.
         poses_of = np.concatenate([none, *pairs])
         own, rows, kinds = (values[: len(poses_of)] for values in (own, rows, kinds))
@@ -167,7 +167,7 @@ def _lines(
     frames: Sequence[EvaluationFrame], own: Integer, rows: Integer, protocol: Protocol
 ) -> tuple[Float, Integer, Integer]:
     """Vertices of all predicted lines, where each begins, and the two lines ``(m, 2)`` of each instance."""
-    if protocol is Protocol.PUBLISHED_PAIRED:
+    if protocol is Protocol.PAIRED:
         lines = [line for frame in frames for line in padded_lines(frame)]
     else:
         lines = [line for frame in frames for line in frame.predicted.polylines]

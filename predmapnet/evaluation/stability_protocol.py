@@ -8,10 +8,10 @@ from enum import StrEnum
 class Protocol(StrEnum):
     """Protocols of the stability metric.
 
-    ``ANCHORED`` has instances of the ground truth, all of them, each with its own poses. ``PUBLISHED_ANCHORED`` is the
-    same with the toolbox's defect, ``PUBLISHED_PAIRED`` the toolbox's protocol without ground truth.
+    ``ANCHORED`` has instances of the ground truth, all of them, each with its own poses. ``PUBLISHED`` is the
+    same with the toolbox's defect, ``PAIRED`` the toolbox's protocol without ground truth.
     """
 
     ANCHORED = "anchored"
-    PUBLISHED_ANCHORED = "published-anchored"
-    PUBLISHED_PAIRED = "published-paired"
+    PUBLISHED = "published"
+    PAIRED = "paired"

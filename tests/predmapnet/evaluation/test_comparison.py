@@ -115,7 +115,7 @@ def test_one_file_broken_files_and_the_same_file_are_refused(write, tmp_path):
 
 def test_stability_of_different_protocols_is_left_out(write):
     first, second = evaluation([0.5] * 12), evaluation([0.5] * 12)
-    for content, protocol in ((first, "anchored"), (second, "published-paired")):
+    for content, protocol in ((first, "anchored"), (second, "paired")):
         content["stability"] = {"protocol": protocol, "interval": 2, "mAS": 0.7}
         for figures in content["per_scene"].values():
             figures["mAS"] = 0.7

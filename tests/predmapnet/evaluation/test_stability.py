@@ -19,8 +19,8 @@ from tests.predmapnet.evaluation.metric_fixtures import REFERENCE, load_metric_c
 
 PUBLISHED = {
     "pkl_all_instances": Protocol.ANCHORED,
-    "pkl_as_is": Protocol.PUBLISHED_ANCHORED,
-    "npz_as_is": Protocol.PUBLISHED_PAIRED,
+    "pkl_as_is": Protocol.PUBLISHED,
+    "npz_as_is": Protocol.PAIRED,
 }
 NAMES = {"presence": "presence", "localization": "localisation", "shape": "shape", "stability": "stability"}
 KINDS = {kind.label: kind for kind in ElementKind}
@@ -47,7 +47,7 @@ def found(reference):
     def of(protocol, key):
         interval = int(key.split("__")[0].removeprefix("interval_"))
         source = "ids_track" if key.endswith("ids_track") else "ids_world"
-        unpublished = Protocol.PUBLISHED_PAIRED if protocol is Protocol.PUBLISHED_PAIRED else Protocol.ANCHORED
+        unpublished = Protocol.PAIRED if protocol is Protocol.PAIRED else Protocol.ANCHORED
         if (unpublished, key) not in made:
             given = reference.inputs["gt_world_id"]
             if source == "ids_track":
@@ -106,7 +106,7 @@ def test_every_instance_has_the_toolbox_match_and_values(reference, found, varia
     np.testing.assert_allclose(result.localisation, expected["localization"], rtol=0, atol=1e-9)
     np.testing.assert_allclose(result.shape, expected["shape"], rtol=0, atol=1e-7)
     np.testing.assert_allclose(result.stability, expected["stability"], rtol=0, atol=1e-7)
-    prefix = f"{variant}__{key}" if protocol is Protocol.PUBLISHED_PAIRED else f"match__{key}"
+    prefix = f"{variant}__{key}" if protocol is Protocol.PAIRED else f"match__{key}"
     rows = [given[f"{prefix}__{side}_pred_row"] for side in ("cur", "pre")]
     start, matched = 0, []
     for frames, instances in scenes:
@@ -226,7 +226,7 @@ def test_a_frame_without_predictions_leaves_its_elements_unmatched():
     empty = replace(empty, predicted=empty.predicted.select(np.zeros(1, dtype=bool)))
     result = measured([frame(0), frame(1), empty, frame(3)])
     assert result.localisation == pytest.approx([0.0, 1.0]) and result.counted.all()
-    assert len(measured([frame(0), frame(1), empty, frame(3)], Protocol.PUBLISHED_PAIRED).kinds) == 1
+    assert len(measured([frame(0), frame(1), empty, frame(3)], Protocol.PAIRED).kinds) == 1
 
 
 def test_short_scenes_and_scenes_without_truth_have_no_instances():
