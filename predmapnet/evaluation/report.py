@@ -28,7 +28,7 @@ h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
 td:first-child, th:first-child { text-align: left; } th { border-bottom: 1px solid #9aa5b1; font-weight: 600; }
 figure { display: inline-block; margin: .5rem 1rem .5rem 0; } figcaption { font-size: .85rem; color: #52606d; }
-.note { color: #52606d; } svg { background: #fff; }
+.wide { overflow-x: auto; font-size: .85rem; } .note { color: #52606d; } svg { background: #fff; }
 """
 
 
@@ -177,13 +177,13 @@ def _scenes_table(per_scene: Mapping[str, Mapping[str, float | int | None]]) -> 
         f"{_cells([per_scene[name][key] for key in SCENE_FIGURES])}</tr>"
         for name in sorted(per_scene, key=worth)
     ]
-    return f"<table><tr>{headings}</tr>{''.join(rows)}</table>"
+    return f'<div class="wide"><table><tr>{headings}</tr>{"".join(rows)}</table></div>'
 
 
 _ROWS = (
     ("chamfer AP", "chamfer_ap", "mAP", "AP"),
-    ("  ahead of the car", "ahead_ap", "mAP", "AP"),
-    ("  behind the car", "rear_ap", "mAP", "AP"),
+    ("chamfer AP ahead of the car", "ahead_ap", "mAP", "AP"),
+    ("chamfer AP behind the car", "rear_ap", "mAP", "AP"),
     ("order-aware AP (Frechet)", "frechet_ap", "mAP", "AP"),
     ("rasterisation AP", "raster_ap", "mAP", "AP"),
     ("consistency AP", "consistency_ap", "mAP", "AP"),

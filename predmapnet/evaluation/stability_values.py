@@ -96,7 +96,7 @@ def stations_of(line: Float) -> Float:  # pragma: no cover - compiled
     if low == high:
         low, high = low - 0.1, high + 0.1
     step = (high - low) / (SAMPLES - 1)
-    stations = low + np.arange(SAMPLES) * step
+    stations: Float = low + np.arange(SAMPLES) * step
     stations[SAMPLES - 1] = high
     return stations
 
