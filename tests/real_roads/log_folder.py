@@ -32,7 +32,7 @@ Float = NDArray[np.float64]
 HALF_A_PIXEL = 0.5
 """From OpenCV's principal point (centre of the first pixel at 0) to ours (at 0.5)."""
 
-LATEST = 80_000_000
+LATEST = 100_000_000
 """An image farther from the frame's instant does not belong to it, nanoseconds."""
 
 
