@@ -40,9 +40,10 @@ STREET_STEP = 5
 """2 Hz of the street's 10; one drive for each frame to begin with, since 16 frames say little."""
 NOTES = """
 cross, div, bound: AP, mean of 0.5, 1.0, 1.5 m; c@.5: crossings at 0.5 m; lines: mean of div and bound.
-along, across: recall at 1.0 m of crossings along the car's road (over side streets) and across it, score 0.3 and more.
+along, across: recall at 1.0 m of crossings along the car's road (over side streets) and across it, from score 0.3.
 P@1, R@1: whole map, length-weighted, at 1.0 m. band: true points that the 95 % band of the map's deviation holds.
-map/true: crossings in the map and in the true one. A dash: no such thing is true there, or nothing was found.""".strip()
+map/true: crossings in the map and in the true one. A dash: nothing of the kind is true there, or none was found.
+""".strip()
 
 
 @dataclass(frozen=True)
@@ -173,7 +174,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=Path, help="write all figures to this file, too")
     parser.add_argument("--weights", type=Path, help="a .safetensors checkpoint; the shipped weights without it")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th frame of each drive")
-    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only lines whose name holds one of these")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NAME", help="only lines whose name holds one of these"
+    )
     options = parser.parse_args(arguments)
     try:
         if options.json:

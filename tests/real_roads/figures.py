@@ -75,9 +75,9 @@ def measure(scene: Scene, run: SceneRun) -> Figures:
     roi = run.frame_maps[0].roi
     map_crossings = len(run.global_map.of_kind(ElementKind.PED_CROSSING))
     believed = {
-        kind.label: float(np.mean([((found.kinds == kind) & (found.scores >= BELIEVED)).sum() for found in run.frame_maps]))
+        kind.label: float(np.mean([(found.kinds[found.scores >= BELIEVED] == kind).sum() for found in run.frame_maps]))
         for kind in ElementKind
-    }  # fmt: skip
+    }
     truths, truth_map = scene.truths(roi), scene.truth_map()
     if truths is None or truth_map is None:
         nothing = dict.fromkeys(list(Figures.__annotations__)[:11])

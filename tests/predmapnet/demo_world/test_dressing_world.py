@@ -9,7 +9,6 @@ import shapely
 from shapely import Polygon, box
 
 from mapfusion.elements import RegionOfInterest
-from tests.real_roads.argoverse_logs import read_log
 from predmapnet.demo_world.catalogue import build_world
 from predmapnet.demo_world.render.lidar import RANGE, scan
 from predmapnet.demo_world.render.renderer import Renderer
@@ -19,6 +18,7 @@ from predmapnet.demo_world.street.traffic import footprint
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Look, Trajectory, VectorMap
 from predmapnet.scenes import Camera
 from tests.predmapnet.demo_world.occlusion import hidden_share
+from tests.real_roads.argoverse_logs import read_log
 
 SMALL_RIG = tuple(
     Camera(camera.name, 256, 144, np.diag([0.32, 0.32, 1.0]) @ camera.intrinsics, camera.camera_to_ego)
