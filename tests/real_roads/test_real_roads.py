@@ -9,10 +9,12 @@ import pytest
 from shapely import Polygon
 
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
+from predmapnet.demo_world.world import Divider, LineStyle, VectorMap
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.scenes import FrameTruth
 from tests.benchmarks.real_roads import Missing, main, parts
 from tests.real_roads.figures import Figures, crossing_recall, is_across, mean_of, table_row
+from tests.real_roads.nuscenes_folder import shifted, with_joined_dividers
 from tests.real_roads.road_maps import drives_along, read_road_map, truth_along
 
 ACROSS = np.array([[5.0, -6.0], [8.0, -6.0], [8.0, 6.0], [5.0, 6.0], [5.0, -6.0]])
@@ -140,3 +142,12 @@ def test_the_command_maps_a_reduced_case(tmp_path, monkeypatch, capsys):
     assert rows["street, all frames"]["true_crossings"] == 0
     assert len(list((tmp_path / "cache").rglob("*.jpg"))) > 0
     assert "mean of av2, demo rig" in capsys.readouterr().out
+
+
+def test_pieces_of_a_painted_line_become_one_if_they_are_painted_alike():
+    pieces = [Divider(np.array([[x, 0.0], [x + 10, 0.0]]), LineStyle.DASHED) for x in (0.0, 10.0)]
+    pieces.append(Divider(np.array([[20.0, 0.0], [30.0, 0.0]]), LineStyle.SOLID))
+    moved = shifted(VectorMap((), (), (), tuple(pieces)), np.array([100.0, 5.0]))
+    lines = with_joined_dividers(moved).dividers
+    assert [line.style for line in lines] == [LineStyle.DASHED, LineStyle.SOLID]
+    np.testing.assert_allclose(lines[0].points, [[100, 5], [110, 5], [120, 5]])
