@@ -19,10 +19,10 @@ from predmapnet.demo_world.catalogue import WORLD_VERSION
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 from predmapnet.demo_world.street.dressing import dress
-from predmapnet.demo_world.world import Look, Trajectory, VectorMap
+from predmapnet.demo_world.world import CrossingStyle, Look, Trajectory, VectorMap
 from predmapnet.files import write_whole
 from predmapnet.machine import available_cores
-from predmapnet.scenes import Camera, Rig
+from predmapnet.scenes import Camera, Rig, Scene
 from tests.real_roads.argoverse_logs import read_log
 from tests.real_roads.log_folder import LogScene, Poses, Truth, image_path, moved_rig, write_poses, write_rig
 from tests.real_roads.road_maps import drives_along, read_road_map, truth_along
@@ -33,7 +33,7 @@ T = TypeVar("T")
 FrameProgress = Callable[[int, int], None]
 
 LOOKS = (Look.DAY, Look.OVERCAST)
-"""Each log is drawn in both; a map's first drive in the first look, its second in the other."""
+"""Each log is drawn in both, dressed anew; a map's first drive in the first look, its second in the other."""
 OWN_SCALE = 0.5
 """The cameras of Argoverse 2 have 2048 x 1550 pixels; they are drawn at half of that."""
 JPEG_QUALITY = 90
@@ -62,6 +62,7 @@ class DressedDrive:
         vector_map: what is painted.
         trajectory: of the ego origin.
         truth: along it.
+        seed: of everything that the map does not tell: wear of the paint, buildings, trees, traffic.
     """
 
     name: str
@@ -71,16 +72,18 @@ class DressedDrive:
     vector_map: VectorMap
     trajectory: Trajectory
     truth: Truth
+    seed: int
 
     def folder(self, cache: Path) -> Path:
         """Where its images are kept: by world version, look, rig, log, and all numbers that decide the images."""
-        numbers = [self.trajectory.timestamps, self.trajectory.ego_to_global]
+        numbers = [np.array(self.seed), self.trajectory.timestamps, self.trajectory.ego_to_global]
         numbers += [part for camera in self.rig for part in (camera.intrinsics, camera.camera_to_ego)]
         numbers += [divider.points for divider in self.vector_map.dividers]
+        numbers += [np.array(list(CrossingStyle).index(crossing.style)) for crossing in self.vector_map.crossings]
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in numbers)).hexdigest()[:10]
         return cache / f"dressed-v{WORLD_VERSION}" / f"{self.name}-{self.look}-{self.rig_name}-{digest}"
 
-    def open(self, cache: Path, step: int = 1, progress: FrameProgress | None = None) -> LogScene:
+    def open(self, cache: Path, step: int = 1, progress: FrameProgress | None = None) -> Scene:
         """Draw what the cache lacks of every ``step``-th frame, and return these frames as a scene."""
         folder = self.folder(cache)
         folder.mkdir(parents=True, exist_ok=True)
@@ -98,8 +101,7 @@ class DressedDrive:
         ]
         if not lacking:
             return
-        seed = zlib.crc32(self.name.encode())
-        renderer = Renderer(dress(self.vector_map, self.trajectory, self.look, seed, self.name))
+        renderer = Renderer(dress(self.vector_map, self.trajectory, self.look, self.seed, self.name))
 
         def draw(row: int) -> None:
             for name, rendered in renderer.render_frame(self.rig, row).items():
@@ -119,6 +121,8 @@ class DressedDrive:
 def dressed_logs(folder: Path) -> Iterator[DressedDrive]:
     """Yield every log below a folder in both looks, with the demo rig and with its own cameras if they are known.
 
+    Each look comes with a dressing of its own: other wear, other styles of crossings, other traffic.
+
     The truth is the official one of Argoverse 2. Only the demo rig's ego origin lies on the road.
     """
     for log in sorted(path.parent for path in folder.glob("*/city_SE3_egovehicle.feather")):
@@ -135,8 +139,23 @@ def dressed_log(folder: Path) -> Iterator[DressedDrive]:
     if logged.rig is not None:
         rigs.append(("own", tuple(_smaller(camera) for camera in logged.rig), logged.trajectory))
     for rig_name, rig, trajectory in rigs:
-        for look in LOOKS:
-            yield DressedDrive(folder.name[:8], look, rig_name, rig, logged.vector_map, trajectory, truth)
+        for number, look in enumerate(LOOKS):
+            painted, seed = repainted(logged.vector_map, number), _seed(folder.name[:8], number)
+            yield DressedDrive(folder.name[:8], look, rig_name, rig, painted, trajectory, truth, seed)
+
+
+def repainted(vector_map: VectorMap, turn: int) -> VectorMap:
+    """Return a map whose crossings are painted in another style each turn: no map says which, and it matters much."""
+    styles = list(CrossingStyle)
+    crossings = (
+        replace(crossing, style=styles[(styles.index(crossing.style) + turn) % len(styles)])
+        for crossing in vector_map.crossings
+    )
+    return replace(vector_map, crossings=tuple(crossings))
+
+
+def _seed(name: str, turn: int) -> int:
+    return zlib.crc32(name.encode()) + turn
 
 
 def _known(truth: T | None) -> T:
@@ -158,4 +177,5 @@ def dressed_maps(folder: Path) -> Iterator[DressedDrive]:
             zip(drives_along(paths, painted, len(LOOKS)), LOOKS, strict=True), start=1
         ):
             truth = truth_along(true_map, trajectory)
-            yield DressedDrive(f"{path.stem}-{number}", look, "demo", CENTRED_DEMO_RIG, painted, trajectory, truth)
+            name = f"{path.stem}-{number}"
+            yield DressedDrive(name, look, "demo", CENTRED_DEMO_RIG, painted, trajectory, truth, _seed(name, 0))

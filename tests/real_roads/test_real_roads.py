@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 from shapely import Polygon
 
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
-from predmapnet.demo_world.world import Divider, LineStyle, VectorMap
+from predmapnet.demo_world.world import Divider, LineStyle, Look, VectorMap
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.scenes import FrameTruth
 from tests.benchmarks.real_roads import Missing, main, parts
+from tests.real_roads.dressed import dressed_maps, repainted
 from tests.real_roads.figures import Figures, crossing_recall, is_across, mean_of, table_row
 from tests.real_roads.nuscenes_folder import shifted, with_joined_dividers
 from tests.real_roads.road_maps import drives_along, read_road_map, truth_along
@@ -151,3 +153,19 @@ def test_pieces_of_a_painted_line_become_one_if_they_are_painted_alike():
     lines = with_joined_dividers(moved).dividers
     assert [line.style for line in lines] == [LineStyle.DASHED, LineStyle.SOLID]
     np.testing.assert_allclose(lines[0].points, [[100, 5], [110, 5], [120, 5]])
+
+
+def test_a_drive_that_looks_different_has_a_folder_of_its_own(road_map, tmp_path):
+    (first, second) = dressed_maps(road_map.parent)
+    others = [
+        first,
+        second,
+        replace(first, look=Look.NIGHT),
+        replace(first, seed=first.seed + 1),
+        replace(first, vector_map=repainted(first.vector_map, 1)),
+        replace(first, rig=first.rig[:5]),
+        replace(first, trajectory=second.trajectory),
+    ]
+    assert len({drive.folder(tmp_path) for drive in others}) == len(others)
+    assert first.folder(tmp_path) == next(iter(dressed_maps(road_map.parent))).folder(tmp_path)
+    assert repainted(first.vector_map, 3) == first.vector_map
