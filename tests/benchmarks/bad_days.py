@@ -29,9 +29,9 @@ from predmapnet.errors import UserError
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene, pool_scenes
-from predmapnet.files import check_output, write_whole
-from predmapnet.map_scene import map_scene
+from predmapnet.files import check_output, write_file
 from predmapnet.mapper import Mapper
+from predmapnet.mapping import map_scene
 from predmapnet.scenes import Scene
 from tests.real_roads.bad_scenes import (
     FaultyImages,
@@ -247,7 +247,7 @@ def main(arguments: list[str] | None = None) -> int:
             raise UserError(f"No line's name holds {' or '.join(words)}. There are: {names}.")
         result = run(scenes, chosen, Mapper.from_checkpoint(options.weights), lambda line: print(line, flush=True))
         if options.json:
-            with write_whole(options.json) as draft:
+            with write_file(options.json) as draft:
                 draft.write_bytes(orjson.dumps(result, option=orjson.OPT_INDENT_2))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -26,9 +26,9 @@ import orjson
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.demo_world.catalogue import WORLD_VERSION, default_cache
 from predmapnet.errors import UserError
-from predmapnet.files import check_output, write_whole
-from predmapnet.map_scene import map_scene
+from predmapnet.files import check_output, write_file
 from predmapnet.mapper import Mapper
+from predmapnet.mapping import map_scene
 from predmapnet.scenes import Scene
 from tests.real_roads.dressed import DressedDrive, dressed_log, dressed_maps
 from tests.real_roads.figures import Figures, mean_of, measure, table_head, table_row
@@ -189,7 +189,7 @@ def main(arguments: list[str] | None = None) -> int:
         mapper = Mapper.from_checkpoint(options.weights)
         result = run(chosen, mapper, lambda line: print(line, flush=True))
         if options.json:
-            with write_whole(options.json) as draft:
+            with write_file(options.json) as draft:
                 draft.write_bytes(orjson.dumps(result | {"every": options.every}, option=orjson.OPT_INDENT_2))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -20,7 +20,7 @@ from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.world import CrossingStyle, Look, Trajectory, VectorMap
-from predmapnet.files import write_whole
+from predmapnet.files import write_file
 from predmapnet.machine import available_cores
 from predmapnet.scenes import Camera, Rig, Scene
 from tests.real_roads.argoverse_logs import read_log
@@ -108,7 +108,7 @@ class DressedDrive:
                 path = image_path(folder, name, stamps[row])
                 path.parent.mkdir(parents=True, exist_ok=True)
                 encoded = cv2.imencode(".jpg", rendered.image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-                with write_whole(path) as draft:
+                with write_file(path) as draft:
                     draft.write_bytes(encoded.tobytes())
 
         threads = int(os.environ.get("OMP_NUM_THREADS") or available_cores())

@@ -18,9 +18,9 @@ from predmapnet.evaluation.chamfer_distance import (
     match_greedily,
     resample_all,
 )
-from predmapnet.evaluation.frames import EvaluationFrame, simplified
+from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
-from predmapnet.map_scene import SceneRun
+from predmapnet.mapping import SceneRun
 from predmapnet.scenes import Scene
 from tests.mapfusion.calibration import share_inside, standard_errors
 from tests.mapfusion.demo_towns import MappedTown
@@ -126,7 +126,7 @@ def crossing_recall(frames: Sequence[EvaluationFrame]) -> tuple[float | None, fl
     for frame in frames:
         truths = [
             line
-            for line, kind in zip(simplified(frame.truth.polylines), frame.truth.kinds, strict=True)
+            for line, kind in zip(simplify_all(frame.truth.polylines), frame.truth.kinds, strict=True)
             if kind == ElementKind.PED_CROSSING
         ]
         rows = (frame.predicted.kinds == ElementKind.PED_CROSSING) & (frame.predicted.scores >= BELIEVED)

@@ -24,7 +24,7 @@ from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.errors import UserError
-from predmapnet.files import write_whole
+from predmapnet.files import write_file
 from predmapnet.scenes import Camera, Frame, FrameTruth, Georeference, Instant, Rig, SceneInfo
 
 Float = NDArray[np.float64]
@@ -79,7 +79,7 @@ def write_poses(path: Path, poses: Poses) -> None:
         x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
         values = [*pose[:3, 3], w, x, y, z]
         lines.append(f"{timestamp}," + ",".join(f"{value:.10f}" for value in values))
-    with write_whole(path) as draft:
+    with write_file(path) as draft:
         draft.write_text("\n".join(lines) + "\n")
 
 
@@ -117,7 +117,7 @@ def write_rig(path: Path, rig: Rig) -> None:
                 "rotation_wxyz": [w, x, y, z],
             },
         }
-    with write_whole(path) as draft:
+    with write_file(path) as draft:
         content = {"ego_origin_above_road_m": -rig[0].ground_height, "cameras": cameras}
         draft.write_text(json.dumps(content, indent=1))
 
