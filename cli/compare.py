@@ -22,9 +22,9 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Of the draws for the intervals.")] = 0,
 ) -> None:
     """Compare methods with the first one: figures with their 95 % intervals over scenes."""
-    from predmapnet.evaluation.comparison import compare as compare_files
+    from predmapnet.evaluation.comparison import compare_evaluations
 
-    found = compare_files(evaluations, seed)
+    found = compare_evaluations(evaluations, seed)
     if as_json:
         import orjson
 

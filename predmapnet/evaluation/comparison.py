@@ -120,7 +120,7 @@ class Comparison:
         }
 
 
-def compare(paths: Sequence[Path], seed: int = 0) -> Comparison:
+def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
     """Compare evaluations.
 
     Args:

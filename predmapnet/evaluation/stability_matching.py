@@ -20,7 +20,7 @@ from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind
 from predmapnet.evaluation.chamfer_distance import resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
-from predmapnet.evaluation.stability_values import localisation_matrix, move
+from predmapnet.evaluation.stability_values import into_current_frame, localisation_matrix
 
 MATCHING_POINTS = 50
 MATCHING_RANGE = (30.0, 60.0)
@@ -92,7 +92,10 @@ def paired_instances(frames: Sequence[EvaluationFrame], interval: int) -> SceneI
         for kind in ElementKind:
             own, others = np.flatnonzero(current.kinds == kind), np.flatnonzero(previous.kinds == kind)
             if len(own) and len(others):
-                moved = [move(lines[before][row], current.ego_to_global, previous.ego_to_global) for row in others]
+                moved = [
+                    into_current_frame(lines[before][row], current.ego_to_global, previous.ego_to_global)
+                    for row in others
+                ]
                 matrix = localisation_matrix(*_flat([lines[now][row] for row in own]), *_flat(moved))
                 first, second = linear_sum_assignment(-matrix)
                 kinds.append(np.full(len(first), int(kind), dtype=np.int64))

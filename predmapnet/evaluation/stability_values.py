@@ -70,7 +70,9 @@ def localisation_matrix(
 
 
 @njit(cache=True)
-def move(points: Float, current_pose: Float, previous_pose: Float) -> Float:  # pragma: no cover - compiled
+def into_current_frame(
+    points: Float, current_pose: Float, previous_pose: Float
+) -> Float:  # pragma: no cover - compiled
     """Move points ``(n, 2)`` from the previous ego frame into the current one; the height is dropped afterwards.
 
     Equal points stay equal to the last bit, which the turning angles rely on.
@@ -171,7 +173,7 @@ def _values(
             continue
         current = points[offsets[lines[row, 0]] : offsets[lines[row, 0] + 1]]
         before = points[offsets[lines[row, 1]] : offsets[lines[row, 1] + 1]]
-        moved = move(before, poses[frames[row, 0]], poses[frames[row, 1]])
+        moved = into_current_frame(before, poses[frames[row, 0]], poses[frames[row, 1]])
         kept = _inside(moved)
         if len(current) and len(kept):
             stations = stations_of(current)
