@@ -30,15 +30,19 @@ def diff(
     """Compare two maps: what was added, removed or moved, and what the later drive did not see."""
     from cli.console import err
     from cli.console import out as screen
+    from cli.console import say_warning
     from mapfusion.diff import DiffConfig, diff_maps, write_diff
     from mapfusion.formats.by_suffix import read_maps
     from predmapnet.errors import value_errors_told
     from predmapnet.files import check_output
 
     if out is not None:
-        check_output(out)
+        check_output(out, (".geojson", ".json"))
     with value_errors_told():
         (before, after), plane = read_maps([old, new])
+    for path, read in ((old, before), (new, after)):
+        for note in read.notes:
+            say_warning(f"{path}: {note}")
     config = DiffConfig(tolerance=tolerance, reach=max(2.0, 2.0 * tolerance), align=align)
     found = diff_maps(before, after, plane, config)
     err.print(_alignment_sentence(found, align), markup=False)

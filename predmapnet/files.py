@@ -11,12 +11,19 @@ import mapfusion.files
 from predmapnet.errors import UserError
 
 
-def check_output(path: Path) -> None:
+def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
     """Check before the work begins that a file can be written at ``path``.
 
+    Args:
+        path: of the file.
+        endings: those that the name may have, in lower case; all without.
+
     Raises:
-        UserError: the folder does not exist or cannot be written to, or ``path`` is a folder itself.
+        UserError: the folder does not exist or cannot be written to, ``path`` is a folder itself, or another program
+            has it open.
     """
+    if endings and path.suffix.lower() not in endings:
+        raise UserError(f"cannot write {path}: only {' or '.join(endings)} can be written there, not '{path.suffix}'")
     if path.is_dir():
         raise UserError(f"cannot write to {path}: it is a folder; name a file, for example {path / 'map.geojson'}")
     folder = path.absolute().parent
@@ -24,6 +31,12 @@ def check_output(path: Path) -> None:
         raise UserError(f"cannot write {path.name}: the folder {folder} does not exist; create it or choose another")
     if not folder.is_dir():
         raise UserError(f"cannot write {path.name}: {folder} is a file, not a folder")
+    companion = mapfusion.files.companion_of_open_file(path.resolve() if path.is_symlink() else path)
+    if companion is not None:
+        raise UserError(
+            f"cannot write {path}: another program (QGIS, for example) has it open, since {companion} is there. Close it "
+            f"there, or choose another name; if no program has it open, delete {companion.name} first"
+        )
     with write_errors_told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
         trial.write(b" ")
 

@@ -10,6 +10,7 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from mapfusion.arrays import Float
+from mapfusion.georeference import check_reach
 
 NUSCENES_ORIGINS = {
     "boston-seaport": (42.336849169438615, -71.05785369873047),
@@ -49,6 +50,7 @@ class SphereGeoreference:
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres (x east, y north) to ``(n, 2)`` longitude and latitude, degrees."""
+        check_reach(points, self.name)
         latitude = np.radians(self.latitude)
         bearing = np.arctan2(points[:, 0], points[:, 1])
         angle = np.hypot(points[:, 0], points[:, 1]) / self.radius
@@ -81,6 +83,7 @@ class UtmGeoreference:
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, city frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        check_reach(points, self.name)
         east, north = self._utm.transform(self.longitude, self.latitude)
         longitude, latitude = self._utm.transform(points[:, 0] + east, points[:, 1] + north, direction="INVERSE")
         return np.stack([longitude, latitude], axis=1)
