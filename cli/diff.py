@@ -28,9 +28,8 @@ def diff(
     ] = True,
 ) -> None:
     """Compare two maps: what was added, removed or moved, and what the later drive did not see."""
-    from cli.console import err
+    from cli.console import err, say_warning
     from cli.console import out as screen
-    from cli.console import say_warning
     from mapfusion.diff import DiffConfig, diff_maps, write_diff
     from mapfusion.formats.by_suffix import read_maps
     from predmapnet.errors import value_errors_told

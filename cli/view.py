@@ -12,7 +12,9 @@ from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
 def view(
-    what: Annotated[str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb or .osm).")],
+    what: Annotated[
+        str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb or .osm).")
+    ],
     web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
     port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
     out: Annotated[

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,8 +36,8 @@ def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
     companion = mapfusion.files.companion_of_open_file(path.resolve() if path.is_symlink() else path)
     if companion is not None:
         raise UserError(
-            f"cannot write {path}: another program (QGIS, for example) has it open, since {companion} is there. Close it "
-            f"there, or choose another name; if no program has it open, delete {companion.name} first"
+            f"cannot write {path}: another program (QGIS, for example) has it open, since {companion} is there. Close "
+            f"it there, or choose another name; if no program has it open, delete {companion.name} first"
         )
     with write_errors_told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
         trial.write(b" ")
@@ -55,3 +57,16 @@ def write_errors_told(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def file_name(name: str) -> str:
+    """Return a name that data brings (of a scene, for example) as one that is safe for a file.
+
+    Names of letters, digits, blanks and ``._+@()-`` stay as they are, unless they begin with a dot or are longer than
+    150 characters. In others, what is not safe becomes ``_``, and a digest keeps different names apart.
+    """
+    safe = re.sub(r"[^\w .+@()-]", "_", name)
+    safe = re.sub(r"^[. ]+|[. ]+$", "_", safe)[:150] or "_"
+    if safe == name:
+        return name
+    return f"{safe}-{hashlib.sha256(name.encode(errors='surrogatepass')).hexdigest()[:8]}"

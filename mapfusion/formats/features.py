@@ -1,8 +1,8 @@
 """Elements from the features of a map file, whatever program saved it last.
 
-A map that :mod:`mapfusion.formats` wrote comes back as it was. Editors of maps (QGIS, JOSM, GDAL) write times anew, leave
-nulls in rows that a person drew, add vertices, and change geometries into multi-part ones: such features are read as a
-person means them, and notes say what was supplied, repaired or left out.
+A map that :mod:`mapfusion.formats` wrote comes back as it was. Editors of maps (QGIS, JOSM, GDAL) write times anew,
+leave nulls in rows that a person drew, add vertices, and change geometries into multi-part ones: such features are read
+as a person means them, and notes say what was supplied, repaired or left out.
 """
 
 from __future__ import annotations
@@ -110,23 +110,21 @@ def _elements(place: int, feature: Feature, notes: ReadingNotes) -> list[_Elemen
     kind = _kind(properties, geometry, place, notes)
     if kind is None:
         return []
-    elements = []
-    for path in paths_of(geometry, kind.is_ring, place, notes):
-        elements.append(
-            _Element(
-                place,
-                kind,
-                feature.to_degrees.positions(path.positions),
-                _deviation(properties.get("deviation_m"), path, place, notes),
-                _told(number_of, properties, "confidence"),
-                _told(number_of, properties, "observations"),
-                _told(time_of, properties, "first_seen"),
-                _told(time_of, properties, "last_seen"),
-                _told(whole_numbers_of, properties, "track_ids"),
-                *_sources(properties, place, notes),
-            )
+    return [
+        _Element(
+            place,
+            kind,
+            feature.to_degrees.positions(path.positions),
+            _deviation(properties.get("deviation_m"), path, place, notes),
+            _told(number_of, properties, "confidence"),
+            _told(number_of, properties, "observations"),
+            _told(time_of, properties, "first_seen"),
+            _told(time_of, properties, "last_seen"),
+            _told(whole_numbers_of, properties, "track_ids"),
+            *_sources(properties, place, notes),
         )
-    return elements
+        for path in paths_of(geometry, kind.is_ring, place, notes)
+    ]
 
 
 def _kind(properties: Mapping[str, Any], geometry: Any, place: int, notes: ReadingNotes) -> ElementKind | None:

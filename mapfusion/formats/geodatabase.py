@@ -205,7 +205,7 @@ def driver_errors_told(path: Path) -> Iterator[None]:
 
 @contextmanager
 def plain_path(path: Path) -> Iterator[Path]:
-    """Yield a path to the same file that pyogrio takes as it is: it cuts names at characters such as ``!`` and ``;``."""
+    """Yield a path to the same file that pyogrio takes as it is: it cuts names at ``!``, ``;`` and ``?``."""
     if not re.search(r"[!;?]|\.zip$", str(path)):
         yield path
         return

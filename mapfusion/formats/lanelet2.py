@@ -15,7 +15,6 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-import numpy as np
 import shapely
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement

@@ -310,7 +310,9 @@ def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
     evidence = sum(element.length * element.observations for element in raw)
     low, high = points.min(axis=0), points.max(axis=0)
     observed = raw.provenance.get("observed")
-    return _MapSummary(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw))
+    return _MapSummary(
+        name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw)
+    )
 
 
 def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list[int]]]:

@@ -43,3 +43,19 @@ def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> U
     token = record.get("token")
     which = f", record {str(token)[:60]}" if token is not None else ""
     return UserError(f"{where}{which}: the field '{name}' {found}; {expected} is expected.")
+
+
+def check_principal_point(intrinsics: Float, width: int, height: int, where: str) -> None:
+    """Raise UserError if a camera's principal point lies outside of its image: they are of different sizes.
+
+    Args:
+        intrinsics: ``(3, 3)``.
+        width, height: pixels of the image.
+        where: file and camera, for the message.
+    """
+    x, y = float(intrinsics[0, 2]), float(intrinsics[1, 2])
+    if not (0.0 < x < width and 0.0 < y < height) or not (intrinsics[[0, 1], [0, 1]] > 0.0).all():
+        raise UserError(
+            f"{where}: the intrinsics (focal lengths {intrinsics[0, 0]:g} and {intrinsics[1, 1]:g}, principal point "
+            f"{x:g}, {y:g}) are not those of images of {width} x {height} pixels. Were the images scaled?"
+        )

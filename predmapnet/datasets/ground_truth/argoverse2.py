@@ -76,6 +76,7 @@ class Argoverse2GroundTruth:
                 for record in content["pedestrian_crossings"].values()
             ]
             areas = [_points(record["area_boundary"]) for record in content["drivable_areas"].values()]
+            areas = [points for points in areas if len(points) >= 3]  # fewer enclose nothing
             self._index_lanes(lanes)
         except (KeyError, TypeError, AttributeError, ValueError, shapely.GEOSException) as error:
             raise UserError(
