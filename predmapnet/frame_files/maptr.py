@@ -1,8 +1,8 @@
 """Results of MapTR and of HDMapNet and its kin in JSON; submissions are recognised and read, too.
 
 Two layouts are turned into that of submissions (:mod:`predmapnet.frame_files.submission`), so that one set of checks
-holds for all. A vector is ``{"pts", "cls_name" or "type", "confidence_level"}``; where ``cls_name`` is absent, ``type`` is 0
-divider, 1 ped_crossing, 2 boundary, as both families number them.
+holds for all. A vector is ``{"pts", "cls_name" or "type", "confidence_level"}``; where ``cls_name`` is absent,
+``type`` is 0 divider, 1 ped_crossing, 2 boundary, as both families number them.
 
 * MapTR, MapTRv2: ``{"results": [{"sample_token", "vectors": [vector, ...]}]}``.
 * HDMapNet, SuperFusion: ``{"results": {token: [vector, ...]}}``.

@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
+from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from predmapnet.errors import UserError
 from predmapnet.scenes import Instant
 
 HOW = (
-    "Each pose needs a token, a timestamp (integer nanoseconds; or timestamp_us, timestamp_ms, timestamp_s) and either ego_to_global (4 x 4), or translation "
+    "Each pose needs a token, a timestamp (integer nanoseconds; "
+    "or timestamp_us, timestamp_ms, timestamp_s) and either ego_to_global (4 x 4), or translation "
     "(x, y, z) and rotation (quaternion w, x, y, z); in CSV the columns token, timestamp, x, y and either yaw "
     "(radians) or qw, qx, qy, qz; scene (or log) is optional"
 )
@@ -43,6 +44,8 @@ TIMES = {
     "timestamp_s": 1_000_000_000,
 }
 """Names of the time of a pose, and the nanoseconds of their unit."""
+MOST_DIGITS = 18
+"""Exponent of the largest time that is looked at."""
 
 
 @dataclass(frozen=True)
@@ -105,9 +108,7 @@ def _in_nanoseconds(path: Path, poses: dict[str, FramePose], notes: list[str] | 
     if unit == "nanoseconds":
         return poses
     if notes is not None:
-        notes.append(
-            f"the time stamps of {path.name} are taken as {unit}: as nanoseconds the car would be far too fast"
-        )
+        notes.append(f"the time stamps of {path.name} are taken as {unit}: in nanoseconds the car would be too fast")
     factor = NANOSECONDS[unit]
     return {token: replace(pose, timestamp=pose.timestamp * factor) for token, pose in poses.items()}
 
@@ -121,8 +122,8 @@ def _check_drives(
         for earlier, later in pairwise(drive):
             if earlier.timestamp == later.timestamp:
                 raise UserError(
-                    f"{path}: the poses {earlier.token} and {later.token} have the same time, {later.timestamp}; times of "
-                    "a drive must differ. Are they rounded?"
+                    f"{path}: the poses {earlier.token} and {later.token} have the same time, {later.timestamp}; times "
+                    "of a drive must differ. Are they rounded?"
                 )
         positions = np.array([pose.ego_to_global[:2, 3] for pose in drive])
         rotations = np.array([pose.ego_to_global[:3, :3] for pose in drive])
@@ -133,8 +134,8 @@ def _check_drives(
             raise UserError(f"{path}: {problem}.")
         if notes is not None and drives_backwards(rotations, positions):
             notes.append(
-                f"by {path.name} the car drives sideways or backwards throughout: the map is right only if it did; x of "
-                "the ego frame points forward"
+                f"by {path.name} the car drives sideways or backwards throughout: the map is right only if it did; x "
+                "of the ego frame points forward"
             )
 
 
@@ -195,15 +196,17 @@ def _pose(where: str, row: Mapping[str, Any]) -> tuple[FramePose, bool]:
 
 
 def _nanoseconds(value: Any, column: str) -> int:
-    """Return a time in the unit of its column, nanoseconds; raises ValueError for one that is no whole number of them."""
+    """Return the nanoseconds of a time in the unit of its column; raises ValueError for no whole number of them."""
     try:
-        number = Fraction(str(value).strip()) if not isinstance(value, bool) else None
-    except (ValueError, ZeroDivisionError):
-        number = None
-    if number is None:
+        number = Decimal(str(value).strip())
+    except InvalidOperation:
+        number = Decimal("NaN")
+    if isinstance(value, bool) or not number.is_finite():
         raise ValueError(f"the {column} is no number: {str(value)[:40]!r}")
+    if number.adjusted() > MOST_DIGITS:
+        raise ValueError(f"the {column} {str(value)[:40]} is too large")
     scaled = number * TIMES[column]
-    if column == "timestamp" and scaled.denominator != 1:
+    if column == "timestamp" and scaled != scaled.to_integral_value():
         raise ValueError(
             f"the timestamp {value} is no whole number of nanoseconds; a column timestamp_s, timestamp_ms or "
             "timestamp_us says another unit"

@@ -172,7 +172,7 @@ def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
                 continue
             if not isinstance(entry, dict) or "scene_name" not in entry or "local_idx" not in entry:
                 raise UserError(
-                    f"{path}, entry {number}: a list of frames needs sample_token, or scene_name and local_idx, in each."
+                    f"{path}, entry {number}: a list of frames needs sample_token (or scene_name, local_idx) in each."
                 )
             yield position_name(entry["scene_name"], entry["local_idx"]), entry
     else:

@@ -67,7 +67,8 @@ class NuScenesGroundTruth:
         self.keep_corners = keep_corners
         self.fingerprint = digest + bytes([keep_corners])
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
-        check_version(content, name)
+        if not isinstance(map_file, Mapping):
+            check_version(content, name)
         try:
             nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
             lines = {line["token"]: line["node_tokens"] for line in content["line"]}
