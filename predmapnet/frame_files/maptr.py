@@ -43,7 +43,7 @@ def read_detections(
     """
     results = load_results(path)
     if is_maptr(results):
-        results = [_as_submission(path, number, entry) for number, entry in enumerate(results)]
+        results = _without_repeats([_as_submission(path, number, entry) for number, entry in enumerate(results)])
     elif isinstance(results, dict) and any(isinstance(entry, list) for entry in results.values()):
         results = {
             token: _of_vectors(f"{path}, frame {token}", entry) if isinstance(entry, list) else entry
@@ -59,6 +59,16 @@ def _as_submission(path: Path, number: int, entry: Any) -> dict[str, Any]:
     if not isinstance(token, (str, int)) or isinstance(token, bool):
         raise UserError(f"{path}, entry {number}: its sample_token is missing; each frame of such a list needs one.")
     return {"sample_token": str(token), **_of_vectors(f"{path}, frame {token}", entry.get("vectors"))}
+
+
+def _without_repeats(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Drop frames that were written before: runs on several devices repeat the first ones, to give each as many."""
+    first: dict[str, dict[str, Any]] = {}
+    for entry in entries:
+        first.setdefault(entry["sample_token"], entry)
+    return [
+        entry for entry in entries if entry is first[entry["sample_token"]] or entry != first[entry["sample_token"]]
+    ]
 
 
 def _of_vectors(where: str, vectors: Any) -> dict[str, Any]:

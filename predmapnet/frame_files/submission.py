@@ -115,8 +115,8 @@ def submitted_frames(
     """
     entries: dict[str, Any] = {}
     for name, entry in _entries(path, results):
-        if name in entries and entries[name] != entry:
-            raise UserError(f"{path} holds the frame {name} twice, with different content.")
+        if name in entries:
+            raise UserError(f"{path} holds the frame {name} twice.")
         entries[name] = entry
     left_out: Counter[str] = Counter()
     frames = {name: _frame_of(f"{path}, frame {name}", entry, left_out) for name, entry in entries.items()}
@@ -172,7 +172,7 @@ def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
                 continue
             if not isinstance(entry, dict) or "scene_name" not in entry or "local_idx" not in entry:
                 raise UserError(
-                    f"{path}, entry {number}: a list of frames needs sample_token (or scene_name, local_idx) in each."
+                    f"{path}, entry {number}: a list of frames needs sample_token, or scene_name and local_idx."
                 )
             yield position_name(entry["scene_name"], entry["local_idx"]), entry
     else:

@@ -225,7 +225,7 @@ class MappingPipeline:
             georeference = local_frame(where if where not in ("", "unknown") else scene.info.name, position)
             notes = (
                 f"the place of {scene.info.name} on Earth is not known (location '{where}'): the map is in metres "
-                "about longitude 0 and latitude 0. --origin latitude,longitude says where the frame of its poses begins",
+                "about longitude 0 and latitude 0. --origin latitude,longitude says where the frame of the poses lies",
             )
         with value_errors_told():
             georeference.to_wgs84(position[None])
