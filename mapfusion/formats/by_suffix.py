@@ -180,11 +180,15 @@ def read_box(path: Path) -> Float | None:
         return None
     if len(box) == 6:  # with heights
         box = [*box[:2], *box[3:5]]
-    if len(box) != 4 or not np.isfinite(box).all():
+    try:
+        numbers = np.array(box, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (4,) or not np.isfinite(numbers).all():
         raise ValueError(f"{path}: the bounding box is not four numbers: {box}")
-    if not (np.abs(box) <= [180.0, 90.0, 180.0, 90.0]).all():
+    if not (np.abs(numbers) <= [180.0, 90.0, 180.0, 90.0]).all():
         raise ValueError(f"{path}: the positions are not longitude and latitude in degrees (WGS84): {box}")
-    return np.array(box, dtype=np.float64)
+    return numbers
 
 
 def _box_of_points(path: Path) -> list[float] | None:

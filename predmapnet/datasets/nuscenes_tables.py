@@ -110,8 +110,10 @@ class Tables:
 
         def keep(record: Record) -> None:
             flag = record.get("is_key_frame")
-            if flag is None:
-                raise UserError(f"{path}, record {record.get('token')}: the field 'is_key_frame' is missing.")
+            if not isinstance(flag, int) or flag not in (0, 1):  # true and false are integers, too
+                raise UserError(
+                    f"{path}, record {record.get('token')}: the field 'is_key_frame' must be true or false, not {flag}."
+                )
             if not flag:
                 return
             calibration = text_field(record, "calibrated_sensor_token", str(path))

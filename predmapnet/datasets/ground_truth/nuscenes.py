@@ -70,7 +70,7 @@ class NuScenesGroundTruth:
         if not isinstance(map_file, Mapping):
             check_version(content, name)
         try:
-            nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
+            nodes = {node["token"]: _position(node) for node in content["node"]}
             lines = {line["token"]: line["node_tokens"] for line in content["line"]}
             polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
             self._index(
@@ -83,7 +83,7 @@ class NuScenesGroundTruth:
                 road_segments=_polygons(content["road_segment"], polygons, nodes),
                 lanes=_polygons(content["lane"], polygons, nodes),
             )
-        except (KeyError, TypeError, shapely.GEOSException, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, IndexError, shapely.GEOSException, ValueError) as error:
             raise UserError(
                 f"{name} is not a nuScenes map expansion of version 1.3 ({type(error).__name__}: {error}). "
                 "Fetch the map expansion again and unpack it into maps/expansion."
@@ -291,6 +291,13 @@ def _polygons(
             continue
         result.append(Polygon(exterior, [hole for hole in holes if hole]))
     return result
+
+
+def _position(node: Mapping[str, Any]) -> tuple[float, float]:
+    x, y = float(node["x"]), float(node["y"])
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f"the node {node['token']} is not finite")
+    return x, y
 
 
 def _line(points: Sequence[tuple[float, float]]) -> LineString:
