@@ -36,7 +36,14 @@ from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_argoverse2_sweep
-from predmapnet.datasets.plausibility import judged_unit, reordered_rotations, rotations_of, trajectory_problem
+from predmapnet.datasets.plausibility import (
+    camera_problem,
+    judged_unit,
+    reordered_rotations,
+    rotations_of,
+    trajectory_problem,
+    unit_quaternions,
+)
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
@@ -275,6 +282,12 @@ class Argoverse2Scene:
         missing = [name for name in ARGOVERSE2_CAMERAS if name not in intrinsics or name not in mounting]
         if missing:
             raise UserError(f"{calibration} does not describe the cameras {', '.join(missing)}.")
+        stored = [[mounting[name][key] for key in QUATERNION] for name in ARGOVERSE2_CAMERAS]
+        quaternions = unit_quaternions(stored)
+        if len(quaternions):
+            problem = camera_problem(rotations_of(quaternions), reordered_rotations(quaternions))
+            if problem is not None:
+                raise UserError(f"{calibration / 'egovehicle_SE3_sensor.feather'}: {problem}.")
         return tuple(_camera(name, intrinsics[name], mounting[name], calibration) for name in ARGOVERSE2_CAMERAS)
 
     @cached_property

@@ -255,7 +255,8 @@ class NuScenesScene:
             if token not in self._tables.samples:
                 raise UserError(f"{self._tables.path('sample')}: sample {token} of {self.info.name} is missing.")
             samples.append(self._tables.samples[token])
-            token = text_field(samples[-1], "next", table)
+            # Some writers of this schema end a scene with null instead of an empty text.
+            token = "" if samples[-1].get("next", "") is None else text_field(samples[-1], "next", table)
             if len(samples) > len(self._tables.samples):
                 raise UserError(f"{self._tables.path('sample')}: the samples of {self.info.name} run in a circle.")
         if not samples:
