@@ -52,6 +52,7 @@ class _MapSummary:
     observed: list[list[list[float]]] | None
     notes: tuple[str, ...]
     frame: str
+    origin: str
 
     @property
     def centre(self) -> Float:
@@ -183,7 +184,7 @@ class _Merge:
             first.setdefault(entry.digest, entry)
         self.entries = list(first.values())
         self.duplicates = tuple(sorted(entry.name for entry in entries if first[entry.digest] is not entry))
-        self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes)
+        self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes) + _copies(self.entries)
         check_frames((entry.name, entry.frame) for entry in entries)
         self.empty = sorted(set(names) - {entry.name for entry in entries})
         self.names = list(names)
@@ -310,9 +311,24 @@ def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
     evidence = sum(element.length * element.observations for element in raw)
     low, high = points.min(axis=0), points.max(axis=0)
     observed = raw.provenance.get("observed")
+    told = repr(sorted(raw.provenance.items()))
+    origin = hashlib.sha256(told.encode()).hexdigest() if "created" in raw.provenance else name
     return _MapSummary(
-        name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw)
+        name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw), origin
     )
+
+
+def _copies(entries: Sequence[_MapSummary]) -> tuple[tuple[str, str], ...]:
+    """Return a note for each map that is an edited copy of another: both say that they were made at the same moment."""
+    first: dict[str, str] = {}
+    notes = []
+    for entry in entries:
+        other = first.setdefault(entry.origin, entry.name)
+        if other != entry.name:
+            notes.append(
+                (entry.name, f"it is a copy of {other} that was edited; both count, as if two drives had seen it")
+            )
+    return tuple(notes)
 
 
 def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list[int]]]:

@@ -339,3 +339,13 @@ def test_maps_of_two_frames_of_unknown_place_are_not_compared(tmp_path):
         read_maps(paths)
     with pytest.raises(ValueError, match="do not lie in one frame"):
         merge_files(paths, tmp_path / "merged.geojson", MergeConfig())
+
+
+def test_an_edited_copy_of_a_map_is_told_in_a_merge(tmp_path):
+    write_map(EXAMPLE, tmp_path / "map.geojson", PLANE)
+    document = json.loads((tmp_path / "map.geojson").read_text())
+    del document["features"][0]
+    (tmp_path / "edited.geojson").write_text(json.dumps(document))
+    paths = [tmp_path / "map.geojson", tmp_path / "edited.geojson"]
+    report = merge_files(paths, tmp_path / "merged.geojson", MergeConfig())
+    assert [name for name, note in report.notes if "copy of" in note] == ["edited"]
