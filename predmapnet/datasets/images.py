@@ -18,7 +18,7 @@ _AS_STORED = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 """Calibration belongs to the pixels as they are stored, so the EXIF orientation is not applied."""
 
 _END_OR_STRAY = re.compile(rb"\xff[^\x00\xff\xd0-\xd7\xda\xc4\xdb-\xdd\xe0-\xef\xfe]", re.DOTALL)
-"""The end, or else a byte after 0xFF that no writer puts into the pixels of a JPEG: no stuffed zero, restart or segment."""
+"""The end, or else a byte after 0xFF that no writer puts into the pixels: no stuffed zero, restart or segment."""
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
