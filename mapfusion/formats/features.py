@@ -16,8 +16,7 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats import foreign_shapes
-from mapfusion.formats.foreign_shapes import paths_of
+from mapfusion.formats.foreign_shapes import DrawnPath, paths_of
 from mapfusion.formats.foreign_values import list_of, number_of, time_of, whole_numbers_of
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.formats.reading_notes import ReadingNotes
@@ -149,7 +148,7 @@ def _told(read: Any, properties: Mapping[str, Any], name: str) -> Any:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _deviation(value: Any, path: foreign_shapes.Path, place: int, notes: ReadingNotes) -> Float | None:
+def _deviation(value: Any, path: DrawnPath, place: int, notes: ReadingNotes) -> Float | None:
     """Return the deviation of each vertex; interpolated where vertices were added or removed."""
     try:
         numbers = [number_of(entry) for entry in list_of(value) or ()]

@@ -17,7 +17,7 @@ SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True)
-class Path:
+class DrawnPath:
     """Line or ring of a feature.
 
     Attributes:
@@ -31,7 +31,7 @@ class Path:
     stored: int
 
 
-def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) -> list[Path]:
+def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) -> list[DrawnPath]:
     """Return the lines (or rings) of a GeoJSON geometry.
 
     Parts of multi-part geometries come one by one, heights are left out, open rings are closed, rings that cross
@@ -46,7 +46,7 @@ def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) ->
     Raises:
         ValueError: positions that are not numbers.
     """
-    found: list[Path] = []
+    found: list[DrawnPath] = []
     if geometry is None:
         notes.add("without a geometry: left out", feature)
         return found
@@ -69,7 +69,7 @@ def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) ->
         if len(positions) < 2 or not np.ptp(positions, axis=0).any():
             notes.add("a line without length: left out", feature)
         else:
-            found.append(Path(positions, np.arange(len(positions)), len(positions)))
+            found.append(DrawnPath(positions, np.arange(len(positions)), len(positions)))
     return found
 
 
@@ -111,7 +111,7 @@ def _positions(coordinates: Any, feature: int, notes: ReadingNotes) -> Float:
     return positions
 
 
-def _rings(positions: Float, feature: int, notes: ReadingNotes) -> list[Path]:
+def _rings(positions: Float, feature: int, notes: ReadingNotes) -> list[DrawnPath]:
     """Return the rings that a drawn ring stands for: one, unless it crosses itself."""
     stored, rows = len(positions), np.arange(len(positions))
     if stored and not np.array_equal(positions[0], positions[-1]):
@@ -123,14 +123,14 @@ def _rings(positions: Float, feature: int, notes: ReadingNotes) -> list[Path]:
         return []
     polygon = shapely.Polygon(positions)
     if polygon.is_valid and polygon.area > 0.0:
-        return [Path(positions, rows, stored)]
+        return [DrawnPath(positions, rows, stored)]
     parts = [part for part in _polygons(shapely.make_valid(polygon)) if part.area > 0.0]
     parts = [part for part in parts if part.area >= SMALLEST_PART * sum(whole.area for whole in parts)]
     if not parts:
         notes.add("a crossing without area: left out", feature)
         return []
     notes.add("a ring that crosses itself: its parts are taken", feature)
-    return [Path(shapely.get_coordinates(part.exterior), None, stored) for part in parts]
+    return [DrawnPath(shapely.get_coordinates(part.exterior), None, stored) for part in parts]
 
 
 def _polygons(geometry: Any) -> Sequence[Any]:

@@ -28,7 +28,7 @@ from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, Looks
 from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.lines import fuse_lines
-from mapfusion.merge.report import MapStatus, MergeReport, short_names
+from mapfusion.merge.report import MapStatus, MergeReport, notes_of_copies, short_names
 from mapfusion.merge.rings import fuse_rings
 from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, cut_line, tiles_of
 
@@ -184,7 +184,8 @@ class _Merge:
             first.setdefault(entry.digest, entry)
         self.entries = list(first.values())
         self.duplicates = tuple(sorted(entry.name for entry in entries if first[entry.digest] is not entry))
-        self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes) + _copies(self.entries)
+        self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes)
+        self.notes += notes_of_copies((entry.name, entry.origin) for entry in self.entries)
         check_frames((entry.name, entry.frame) for entry in entries)
         self.empty = sorted(set(names) - {entry.name for entry in entries})
         self.names = list(names)
@@ -316,19 +317,6 @@ def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
     return _MapSummary(
         name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw), origin
     )
-
-
-def _copies(entries: Sequence[_MapSummary]) -> tuple[tuple[str, str], ...]:
-    """Return a note for each map that is an edited copy of another: both say that they were made at the same moment."""
-    first: dict[str, str] = {}
-    notes = []
-    for entry in entries:
-        other = first.setdefault(entry.origin, entry.name)
-        if other != entry.name:
-            notes.append(
-                (entry.name, f"it is a copy of {other} that was edited; both count, as if two drives had seen it")
-            )
-    return tuple(notes)
 
 
 def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list[int]]]:

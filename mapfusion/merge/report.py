@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,3 +67,18 @@ def short_names(paths: Sequence[Path]) -> list[str]:
     if not paths:
         return []
     raise ValueError(f"a map is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+
+
+def notes_of_copies(maps: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Return a note for each map that is an edited copy of another.
+
+    Args:
+        maps: names, and digests of what the maps say of their making, the moment included.
+    """
+    first: dict[str, str] = {}
+    notes = []
+    for name, origin in maps:
+        other = first.setdefault(origin, name)
+        if other != name:
+            notes.append((name, f"it is a copy of {other} that was edited; both count, as if two drives had seen it"))
+    return tuple(notes)

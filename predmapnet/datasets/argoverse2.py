@@ -36,14 +36,7 @@ from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_argoverse2_sweep
-from predmapnet.datasets.plausibility import (
-    camera_problem,
-    judged_unit,
-    reordered_rotations,
-    rotations_of,
-    trajectory_problem,
-    unit_quaternions,
-)
+from predmapnet.datasets.log_checks import check_cameras, check_clock, check_drive
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
@@ -255,15 +248,8 @@ class Argoverse2Scene:
         quaternions = np.stack([table[name] for name in QUATERNION], axis=1).astype(np.float64)
         positions = np.stack([table[name] for name in TRANSLATION[:2]], axis=1).astype(np.float64)
         whole = np.isfinite(positions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 1e-3)
-        if whole.sum() < 2:
-            return
-        unit = judged_unit(table["timestamp_ns"][whole], positions[whole])
-        if unit != "nanoseconds":
-            raise UserError(f"{path}: the time stamps seem to be {unit}; Argoverse 2 has nanoseconds.")
-        kept = quaternions[whole]
-        problem = trajectory_problem(rotations_of(kept), positions[whole], reordered_rotations(kept))
-        if problem is not None:
-            raise UserError(f"{path}: {problem}.")
+        check_clock(table["timestamp_ns"][whole], positions[whole], "nanoseconds", str(path))
+        check_drive(quaternions[whole], positions[whole], str(path))
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -283,11 +269,7 @@ class Argoverse2Scene:
         if missing:
             raise UserError(f"{calibration} does not describe the cameras {', '.join(missing)}.")
         stored = [[mounting[name][key] for key in QUATERNION] for name in ARGOVERSE2_CAMERAS]
-        quaternions = unit_quaternions(stored)
-        if len(quaternions):
-            problem = camera_problem(rotations_of(quaternions), reordered_rotations(quaternions))
-            if problem is not None:
-                raise UserError(f"{calibration / 'egovehicle_SE3_sensor.feather'}: {problem}.")
+        check_cameras(stored, f"{calibration / 'egovehicle_SE3_sensor.feather'}")
         return tuple(_camera(name, intrinsics[name], mounting[name], calibration) for name in ARGOVERSE2_CAMERAS)
 
     @cached_property

@@ -22,19 +22,11 @@ from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.large_tables import Record
 from predmapnet.datasets.lidar import read_nuscenes_sweep
-from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Tables
-from predmapnet.datasets.plausibility import (
-    camera_problem,
-    judged_unit,
-    reordered_rotations,
-    rotations_of,
-    trajectory_problem,
-    unit_quaternions,
-)
+from predmapnet.datasets.log_checks import check_cameras, check_clock, check_drive, usable_poses
+from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Tables, choose_version, expansion_path
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
-from predmapnet.files import file_name
 from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
 
 OLD_SPLIT = {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"}
@@ -43,37 +35,6 @@ NEW_SPLIT = {"train": "nuscenes_new_train", "val": "nuscenes_new_val"}
 DEMO_MARKER = "demo_world.json"
 """A data set with this file in its root was rendered by the demo world."""
 LEFT_OUT = "left out of the published training sets"
-
-
-def find_versions(root: Path) -> tuple[str, ...]:
-    """Return the names of the ``v1.0-*`` table folders below ``root``, sorted."""
-    return tuple(sorted(path.parent.name for path in root.glob("v1.0-*/scene.json")))
-
-
-def choose_version(root: Path, version: str | None) -> str:
-    """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
-
-    Raises:
-        UserError: nothing there, not what was asked for, or several without a clear first choice.
-    """
-    if not root.is_dir():
-        raise UserError(f"The nuScenes folder {root} does not exist.")
-    versions = find_versions(root)
-    if not versions:
-        raise UserError(
-            f"{root} holds no nuScenes tables: looked for folders v1.0-*/ with scene.json in them. "
-            "The data root is the folder that contains v1.0-trainval (or v1.0-mini), samples and maps."
-        )
-    if version is not None:
-        if version not in versions:
-            raise UserError(f"{root} holds no nuScenes version '{version}'; found: {', '.join(versions)}.")
-        return version
-    if "v1.0-trainval" in versions:
-        return "v1.0-trainval"
-    others = [name for name in versions if name != "v1.0-mini"] or ["v1.0-mini"]
-    if len(others) > 1:
-        raise UserError(f"{root} holds several nuScenes versions ({', '.join(versions)}): say which one to open.")
-    return others[0]
 
 
 class NuScenesSource:
@@ -185,11 +146,6 @@ class NuScenesSource:
         return self._maps[location]
 
 
-def expansion_path(root: Path, location: str) -> Path:
-    """Return where the map expansion of a location lies; the name comes from a table and must not lead elsewhere."""
-    return root / "maps" / "expansion" / f"{file_name(location)}.json"
-
-
 @dataclass(frozen=True)
 class _KeyFrame:
     """Records of one sample."""
@@ -234,8 +190,7 @@ class NuScenesScene:
         self._sensor_poses: dict[str, Float] = {}
         self._frames = self._read_frames()
         self._cameras = self._read_cameras()
-        self._check_sensors()
-        self._check_drive()
+        self._check()
         self.rig: Rig = self.frame(0).rig
 
     def __len__(self) -> int:
@@ -294,36 +249,20 @@ class NuScenesScene:
             )
         return cameras
 
-    def _check_sensors(self) -> None:
-        """Raise UserError for cameras that look at the road only if their quaternions are x, y, z, w."""
+    def _check(self) -> None:
+        """Raise UserError for times that do not go on or are of another unit, and for cameras and poses of no car."""
+        name, path = self.info.name, self._tables.path
         stored = [self._calibration(record).get("rotation") for record in self._cameras.values()]
-        quaternions = unit_quaternions(stored)
-        if len(quaternions):
-            problem = camera_problem(rotations_of(quaternions), reordered_rotations(quaternions))
-            if problem is not None:
-                raise UserError(f"{self._tables.path('calibrated_sensor')}, {self.info.name}: {problem}.")
-
-    def _check_drive(self) -> None:
-        """Raise UserError for times that do not go on or are of another unit, and for poses that no car has."""
+        check_cameras(stored, f"{path('calibrated_sensor')}, {name}")
         times = np.array([frame.timestamp // 1000 for frame in self._frames], dtype=np.int64)
-        where = f"{self._tables.path('sample')}, {self.info.name}"
         late = np.flatnonzero(np.diff(times) <= 0)
         if len(late):
             frame = int(late[0]) + 1
-            raise UserError(f"{where}: the time of frame {frame}, {times[frame]}, is not after that of the one before.")
+            raise UserError(f"{path('sample')}, {name}: the time of frame {frame} is not after that of the one before.")
         poses = [frame.ego_pose or {} for frame in self._frames]
-        places = [unit_quaternions([pose.get("rotation")]) for pose in poses]
-        whole = [row for row, place in enumerate(places) if len(place) and _is_position(poses[row].get("translation"))]
-        if len(whole) < 2:
-            return
-        positions = np.array([poses[row]["translation"][:2] for row in whole], dtype=np.float64)
-        unit = judged_unit(times[whole], positions, "microseconds")
-        if unit != "microseconds":
-            raise UserError(f"{where}: the time stamps seem to be {unit}; nuScenes' tables hold microseconds.")
-        quaternions = np.concatenate([places[row] for row in whole])
-        problem = trajectory_problem(rotations_of(quaternions), positions, reordered_rotations(quaternions))
-        if problem is not None:
-            raise UserError(f"{self._tables.path('ego_pose')}, {self.info.name}: {problem}.")
+        rows, quaternions, positions = usable_poses([(pose.get("rotation"), pose.get("translation")) for pose in poses])
+        check_clock(times[rows], positions, "microseconds", f"{path('sample')}, {name}")
+        check_drive(quaternions, positions, f"{path('ego_pose')}, {name}")
 
     def _where(self, index: int, table: str) -> str:
         return f"{self.info.name}, frame {index}, {self._tables.folder / table}.json"
@@ -418,8 +357,8 @@ class NuScenesScene:
 
     def lidar_path(self, index: int) -> Path | None:
         """Return the lidar file of frame ``index``, or None if it is not there."""
-        table = str(self._tables.path("sample_data"))
-        path = self._root / text_field(self._frames[index].sensors[LIDAR], "filename", table)
+        record, table = self._frames[index].sensors[LIDAR], str(self._tables.path("sample_data"))
+        path = self._root / text_field(record, "filename", table)
         return path if path.is_file() else None
 
     def lidar(self, index: int) -> Float | None:
@@ -456,12 +395,3 @@ def _pose(record: Record, where: str) -> Float:
         if record.get(name) is None:
             raise UserError(f"{where}, record {record.get('token')}: the field '{name}' is missing.")
     return pose_matrix(record["rotation"], record["translation"], where)
-
-
-def _is_position(value: object) -> bool:
-    """Whether a value is a position that can be used; others are told of where they are read."""
-    return (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(isinstance(number, (int, float)) and np.isfinite(number) for number in value)
-    )

@@ -15,10 +15,47 @@ from typing import Any, NamedTuple
 from predmapnet.datasets.fields import text_field
 from predmapnet.datasets.large_tables import Record, parse_json, select_records
 from predmapnet.errors import UserError
+from predmapnet.files import file_name
 
 LIDAR = "LIDAR_TOP"
 NUSCENES_CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 """The cameras in the order of the official vector-map data sets."""
+
+
+def find_versions(root: Path) -> tuple[str, ...]:
+    """Return the names of the ``v1.0-*`` table folders below ``root``, sorted."""
+    return tuple(sorted(path.parent.name for path in root.glob("v1.0-*/scene.json")))
+
+
+def choose_version(root: Path, version: str | None) -> str:
+    """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
+
+    Raises:
+        UserError: nothing there, not what was asked for, or several without a clear first choice.
+    """
+    if not root.is_dir():
+        raise UserError(f"The nuScenes folder {root} does not exist.")
+    versions = find_versions(root)
+    if not versions:
+        raise UserError(
+            f"{root} holds no nuScenes tables: looked for folders v1.0-*/ with scene.json in them. "
+            "The data root is the folder that contains v1.0-trainval (or v1.0-mini), samples and maps."
+        )
+    if version is not None:
+        if version not in versions:
+            raise UserError(f"{root} holds no nuScenes version '{version}'; found: {', '.join(versions)}.")
+        return version
+    if "v1.0-trainval" in versions:
+        return "v1.0-trainval"
+    others = [name for name in versions if name != "v1.0-mini"] or ["v1.0-mini"]
+    if len(others) > 1:
+        raise UserError(f"{root} holds several nuScenes versions ({', '.join(versions)}): say which one to open.")
+    return others[0]
+
+
+def expansion_path(root: Path, location: str) -> Path:
+    """Return where the map expansion of a location lies; the name comes from a table and must not lead elsewhere."""
+    return root / "maps" / "expansion" / f"{file_name(location)}.json"
 
 
 class SensorData(NamedTuple):

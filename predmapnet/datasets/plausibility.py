@@ -71,6 +71,8 @@ def trajectory_problem(rotations: Float, positions: Float, reordered: Float | No
     Returns:
         A sentence that says which order would fit, if one does.
     """
+    if len(rotations) < 2:
+        return None
     odd, judged, tilted = _oddness(rotations, positions)
     if reordered is not None and judged.sum() >= 2 and odd[judged].mean() > 0.8:
         other, other_judged, _ = _oddness(reordered, positions)
@@ -86,6 +88,8 @@ def trajectory_problem(rotations: Float, positions: Float, reordered: Float | No
 
 def drives_backwards(rotations: Float, positions: Float) -> bool:
     """Whether a car drives sideways or backwards throughout; arguments as of :func:`trajectory_problem`."""
+    if len(rotations) < 2:
+        return False
     odd, judged, tilted = _oddness(rotations, positions)
     moving = judged & ~tilted
     return bool(moving.sum() >= 3 and odd[moving].mean() > 0.9)
