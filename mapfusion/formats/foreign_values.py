@@ -34,8 +34,9 @@ def parse_timestamp(text: str) -> int:
     match = _TIME.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"not a timestamp of the form 2024-01-31T12:00:00.123456789Z: {text!r}")
-    *date, second, fraction, zone = match.groups()
-    moment = datetime(*map(int, date), int(second or 0), tzinfo=UTC) - EPOCH  # type: ignore[arg-type]
+    *_, second, fraction, zone = match.groups()
+    year, month, day, hour, minute = map(int, match.groups()[:5])
+    moment = datetime(year, month, day, hour, minute, int(second or 0), tzinfo=UTC) - EPOCH
     offset = 0
     if zone not in (None, "Z"):
         digits = zone[1:].replace(":", "").ljust(4, "0")

@@ -141,8 +141,8 @@ def _layers(plain: Path, path: Path, notes: ReadingNotes) -> list[str]:
     """Return the layers that hold a map; raises ValueError if there is none."""
     import pyogrio
 
-    found = []
-    others = []
+    found: list[str] = []
+    others: list[str] = []
     for name, geometry in pyogrio.list_layers(plain):
         if geometry is None:  # a table without geometries: styles of QGIS and the like
             continue

@@ -203,15 +203,16 @@ class NuScenesScene:
 
     def _read_frames(self) -> list[_KeyFrame]:
         samples: list[Record] = []
-        table = str(self._tables.path("scene"))
-        token = text_field(self._tables.scenes[self.info.name], "first_sample_token", table)
+        scene = self._tables.scenes[self.info.name]
+        token = text_field(scene, "first_sample_token", str(self._tables.path("scene")))
         table = str(self._tables.path("sample"))
         while token:
             if token not in self._tables.samples:
                 raise UserError(f"{self._tables.path('sample')}: sample {token} of {self.info.name} is missing.")
             samples.append(self._tables.samples[token])
             # Some writers of this schema end a scene with null instead of an empty text.
-            token = "" if samples[-1].get("next", "") is None else text_field(samples[-1], "next", table)
+            ended = samples[-1].get("next", "") is None and token == scene.get("last_sample_token")
+            token = "" if ended else text_field(samples[-1], "next", table)
             if len(samples) > len(self._tables.samples):
                 raise UserError(f"{self._tables.path('sample')}: the samples of {self.info.name} run in a circle.")
         if not samples:

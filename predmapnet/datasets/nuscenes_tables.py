@@ -6,6 +6,7 @@ key frames of the cameras and the lidar. The tables are parsed in pieces, and on
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,13 +14,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from predmapnet.datasets.fields import text_field
-from predmapnet.datasets.large_tables import Record, parse_json, select_records
+from predmapnet.datasets.large_tables import Mark, Record, parse_json, select_records
 from predmapnet.errors import UserError
 from predmapnet.files import file_name
 
 LIDAR = "LIDAR_TOP"
 NUSCENES_CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 """The cameras in the order of the official vector-map data sets."""
+
+_KEY_FRAME = re.compile(rb'"is_key_frame"\s*:\s*(true|false)')
+_TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
 
 
 def find_versions(root: Path) -> tuple[str, ...]:
@@ -161,7 +165,7 @@ class Tables:
                 data = SensorData(*map(record.get, SensorData._fields))
                 result.setdefault(sample, {})[channels[calibration]] = data
 
-        select_records(path, keep)
+        select_records(path, keep, Mark(_KEY_FRAME, {b"true"}.__contains__))
         return result
 
     def sample_data(self, sample_tokens: Iterable[str]) -> dict[str, dict[str, Record]]:
@@ -179,9 +183,12 @@ class Tables:
         path = self.path("ego_pose")
 
         def keep(record: Record) -> Record | None:
-            return record if text_field(record, "token", str(path)) in wanted else None
+            token = record.get("token")
+            return record if isinstance(token, str) and token in wanted else None
 
-        return {record["token"]: record for record in select_records(path, keep)}
+        encoded = {token.encode() for token in wanted}
+        records = select_records(path, keep, Mark(_TOKEN, encoded.__contains__))
+        return {record["token"]: record for record in records}
 
     def ego_poses(self, tokens: Iterable[str]) -> dict[str, Record]:
         """Return ``ego_pose`` records of the lidar's key frames by token; tokens that the table lacks are absent."""

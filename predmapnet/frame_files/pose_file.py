@@ -103,7 +103,7 @@ def _drives(poses: Mapping[str, FramePose]) -> list[list[FramePose]]:
 def _in_nanoseconds(path: Path, poses: dict[str, FramePose], notes: list[str] | None) -> dict[str, FramePose]:
     """Return the poses with their times in nanoseconds, judged by size and speed where the file names no unit."""
     longest = max(_drives(poses), key=len)
-    times = np.array([pose.timestamp for pose in longest], dtype=np.float64)
+    times = np.array([pose.timestamp for pose in longest], dtype=np.int64)
     unit = judged_unit(times, np.array([pose.ego_to_global[:2, 3] for pose in longest]))
     if unit == "nanoseconds":
         return poses

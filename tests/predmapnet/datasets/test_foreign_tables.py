@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from mapfusion import RegionOfInterest
 from predmapnet.datasets import large_tables
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
-from predmapnet.datasets.large_tables import select_records
+from predmapnet.datasets.large_tables import Mark, select_records
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.errors import UserError
 
@@ -59,6 +60,27 @@ def test_pieces_give_what_a_json_reader_sees(tmp_path_factory, records, indent, 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(large_tables, "PIECE", piece)
         assert select_records(path, lambda record: record) == records
+
+
+MARK = Mark(re.compile(rb'"flag"\s*:\s*(true|false)'), lambda value: value == b"true")
+FLAGGED = st.fixed_dictionaries({"flag": st.booleans()}, optional={"a": VALUES, "b": VALUES, "flag ": VALUES})
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    records=st.lists(FLAGGED | st.dictionaries(st.sampled_from(["flag", "{", "},{"]), VALUES, max_size=3), max_size=9),
+    indent=st.sampled_from([None, 0, 2]),
+    piece=st.integers(1, 60),
+)
+def test_records_passed_over_by_their_text_are_those_that_a_json_reader_leaves_out(
+    tmp_path_factory, records, indent, piece
+):
+    path = tmp_path_factory.mktemp("tables") / "table.json"
+    path.write_text(json.dumps(records, indent=indent))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(large_tables, "PIECE", piece)
+        chosen = select_records(path, lambda record: record if record.get("flag") is True else None, MARK)
+    assert chosen == [record for record in records if record.get("flag") is True]
 
 
 @pytest.mark.parametrize("text", ["", "[", '[{"a": 1}', '[{"a": 1}] x', "{}", "[1]", '[{"a": 1}, {"a": }]', "\x00"])
