@@ -287,6 +287,10 @@ def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
 def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap], cache: Path | None) -> list[EvaluationFrame]:
     truths = scene.truths(frame_maps[0].roi, cache) if frame_maps else []
     if truths is None:
-        raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
+        raise UserError(
+            f"{scene.info.name} has no ground truth, so nothing can be measured against it; it is looked for in "
+            f"maps/expansion/{scene.info.location}.json of a nuScenes data set (the map expansion, unpacked there), "
+            "and in map/log_map_archive_*.json of an Argoverse 2 log."
+        )
     pairs = zip(frame_maps, truths, strict=True)
     return [EvaluationFrame(scene.info.name, index, found, truth) for index, (found, truth) in enumerate(pairs)]
