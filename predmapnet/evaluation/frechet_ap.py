@@ -81,7 +81,7 @@ def _leash(first: Float, second: Float, most: float, row: Float) -> float:  # pr
             best_of_row = min(best_of_row, reach)
         if best_of_row > most:
             return np.inf
-    return row[count - 1]
+    return float(row[count - 1])
 
 
 @njit(cache=True)

@@ -149,7 +149,7 @@ def stability(
         near,
         alike,
         np.clip(there * together, 0.0, 1.0),
-        (scores >= UNDETECTED).any(axis=1),
+        np.asarray((scores >= UNDETECTED).any(axis=1)),
     )
 
 
