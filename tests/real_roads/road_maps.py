@@ -14,9 +14,9 @@ from shapely import Polygon
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import arc_length, resample
-from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import join_lines, truth_map
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
+from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
@@ -78,7 +78,7 @@ def _crossing(number: int, polygon: Polygon) -> Crossing:
 
 def truth_along(true_map: VectorMap, trajectory: Trajectory) -> Truth:
     """Return the truth of a drive by the rules of nuScenes; the ego origin is the centre of the region."""
-    truth = NuScenesGroundTruth.from_vector_map(true_map)
+    truth = truth_from_vector_map(true_map)
     turned = np.eye(4)
     turned[:3, :3] = LIDAR_TO_EGO[:3, :3]
     poses = trajectory.ego_to_global @ turned
