@@ -30,6 +30,7 @@ from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene, pool_scenes
 from predmapnet.files import check_output, write_file
+from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.mapping import map_scene
 from predmapnet.scenes import Scene
@@ -245,7 +246,12 @@ def main(arguments: list[str] | None = None) -> int:
         if len(chosen) == 1 and words and CLEAN not in words:
             names = "; ".join(condition.name for condition in found)
             raise UserError(f"No line's name holds {' or '.join(words)}. There are: {names}.")
-        result = run(scenes, chosen, Mapper.from_checkpoint(options.weights), lambda line: print(line, flush=True))
+        result = run(
+            scenes,
+            chosen,
+            Mapper.from_checkpoint(NetworkOptions(weights=options.weights)),
+            lambda line: print(line, flush=True),
+        )
         if options.json:
             with write_file(options.json) as draft:
                 draft.write_bytes(orjson.dumps(result, option=orjson.OPT_INDENT_2))

@@ -27,6 +27,7 @@ from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.demo_world.catalogue import WORLD_VERSION, default_cache
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_file
+from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.mapping import map_scene
 from predmapnet.scenes import Scene
@@ -186,7 +187,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not chosen:
             names = "; ".join(part.name for part in found)
             raise UserError(f"No line's name holds {' or '.join(options.only)}. There are: {names}.")
-        mapper = Mapper.from_checkpoint(options.weights)
+        mapper = Mapper.from_checkpoint(NetworkOptions(weights=options.weights))
         result = run(chosen, mapper, lambda line: print(line, flush=True))
         if options.json:
             with write_file(options.json) as draft:
