@@ -11,17 +11,23 @@ from pathlib import Path
 
 import numpy as np
 
-from predmapnet.demo_world.town.routes import KEY_FRAMES, drive
+from predmapnet.demo_world.town.driving import KEY_FRAMES
+from predmapnet.demo_world.town.routes import drive
 from predmapnet.demo_world.town.town import Town, build_town
+from predmapnet.demo_world.town_v1.routes import drive as drive_first
+from predmapnet.demo_world.town_v1.town import build_town as build_first_town
 from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
-WORLD_VERSION = 1
+WORLD_VERSION = 2
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
 
-SPLITS: dict[str, range] = {"train": range(201, 601), "val": range(1, 11), "test": range(101, 111)}
+SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "test": range(101, 111)}
 """Scene numbers. Each scene has a town of its own whose seed is its number, so that no town is in two splits."""
+
+FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
+"""Scenes of the first world that are kept, so that networks can be compared with older ones."""
 
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """How often each look is drawn for a training scene."""
@@ -41,10 +47,16 @@ _TEN_LOOKS = (
 """Looks of the ten validation and the ten test scenes, in order: the same shares, and every look at least once."""
 
 
-def scene_infos(split: str | None = None) -> tuple[SceneInfo, ...]:
+def splits_of(edition: int = WORLD_VERSION) -> dict[str, range]:
+    """The scenes of an edition of the world: the present one has all, the first its test towns."""
+    return FIRST_SPLITS if edition == 1 else SPLITS
+
+
+def scene_infos(split: str | None = None, edition: int = WORLD_VERSION) -> tuple[SceneInfo, ...]:
     """List the scenes of one split, or of all. Raises UserError for a split that does not exist."""
-    if split is not None and split not in SPLITS:
-        raise UserError(f"The demo world has no split '{split}'. It has: {', '.join(SPLITS)}.")
+    splits = splits_of(edition)
+    if split is not None and split not in splits:
+        raise UserError(f"The demo world has no split '{split}'. It has: {', '.join(splits)}.")
     return tuple(
         SceneInfo(
             name=f"scene-{number:04d}",
@@ -54,15 +66,15 @@ def scene_infos(split: str | None = None) -> tuple[SceneInfo, ...]:
             ready=False,
             description=f"demo world, {look_of(f'scene-{number:04d}')}",
         )
-        for name, numbers in SPLITS.items()
+        for name, numbers in splits.items()
         if split in (None, name)
         for number in numbers
     )
 
 
-def scene_number(name: str) -> int:
+def scene_number(name: str, edition: int = WORLD_VERSION) -> int:
     """The number of a scene, which is the seed of its town. Raises UserError for a name that does not exist."""
-    names = {f"scene-{number:04d}": number for numbers in SPLITS.values() for number in numbers}
+    names = {f"scene-{number:04d}": number for numbers in splits_of(edition).values() for number in numbers}
     if name not in names:
         near = ", ".join(_nearest_names(name, names))
         raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {near}.")
@@ -102,11 +114,15 @@ def trajectory(name: str) -> Trajectory:
     return drive(town_of(name), scene_number(name))
 
 
-def build_world(name: str) -> World:
-    """Everything the renderer needs to draw a scene."""
+def build_world(name: str, edition: int = WORLD_VERSION) -> World:
+    """Everything the renderer needs to draw a scene, of the present world or of the first one (edition 1)."""
     from predmapnet.demo_world.street.dressing import dress
 
-    return dress(vector_map(name), trajectory(name), look_of(name), scene_number(name), name)
+    number = scene_number(name, edition)
+    if edition == 1:
+        first = build_first_town(number)
+        return dress(first.vector_map, drive_first(first, number), look_of(name), number, name)
+    return dress(vector_map(name), trajectory(name), look_of(name), number, name)
 
 
 def default_cache() -> Path:
@@ -119,18 +135,19 @@ def default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "predmapnet"
 
 
-def scene_folder(name: str, cache: Path) -> Path:
+def scene_folder(name: str, cache: Path, edition: int = WORLD_VERSION) -> Path:
     """Where a scene lies as a nuScenes data set, whether it has been rendered or not."""
-    return cache / f"demo-world-v{WORLD_VERSION}" / name
+    return cache / f"demo-world-v{WORLD_VERSION}{'-first-towns' if edition == 1 else ''}" / name
 
 
-def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Path:
+def ensure_scene(name: str, cache: Path, progress: Progress | None = None, edition: int = WORLD_VERSION) -> Path:
     """Render a scene unless that has been done.
 
     Args:
         name: for example ``scene-0103``.
         cache: the folder that holds all scenes.
         progress: called once per key frame.
+        edition: of the world; 1 has the towns of the first one, drawn as scenes are drawn today.
 
     Returns:
         The root of a nuScenes data set (``v1.0-mini``, ``samples``, ``maps``) with this one scene.
@@ -138,10 +155,10 @@ def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Pa
     Raises:
         UserError: the scene does not exist, or the cache cannot be written.
     """
-    folder = scene_folder(name, cache)
-    scene_number(name)
+    folder = scene_folder(name, cache, edition)
+    scene_number(name, edition)
     if not folder.exists():
         from predmapnet.demo_world.nuscenes.writer import write_scene
 
-        write_scene(build_world(name), folder, WORLD_VERSION, progress=progress)
+        write_scene(build_world(name, edition), folder, WORLD_VERSION, progress=progress)
     return folder

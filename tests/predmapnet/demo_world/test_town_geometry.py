@@ -3,11 +3,11 @@ from functools import cache
 import numpy as np
 import pytest
 import shapely
+from predmapnet.demo_world.town.town_plan import plan_town
 
 from predmapnet.demo_world.catalogue import SPLITS, vector_map
 from predmapnet.demo_world.nuscenes.map_expansion import CANVAS_EDGE
 from predmapnet.demo_world.town.town import build_town
-from predmapnet.demo_world.town.town_plan import plan_town
 from predmapnet.demo_world.world import LineStyle
 
 SEEDS = [*SPLITS["test"], *range(201, 213)]
