@@ -18,8 +18,9 @@ def shape_street(random: Generator, plan: StreetPlan, index: int, section: Cross
     street = plan.streets[index]
     if street.rank is Rank.ALLEY:
         return
-    if random.random() < 0.3:
+    if random.random() < 0.5:
         _end_lane(random, section, street.line.length)
+    _vary_widths(random, section, street.line.length)
     bulbs = random.random() < 0.35
     for place, (station, node) in enumerate(street.stops):
         if node < 0:
@@ -29,8 +30,8 @@ def shape_street(random: Generator, plan: StreetPlan, index: int, section: Cross
         sides = _sides_joined(plan, index, node, station)
         if bulbs:
             _bring_kerbs_forward(random, section, station)
-        big = street.rank is Rank.ARTERIAL or random.random() < 0.35
-        if not section.one_way and big and random.random() < 0.42 and sides:
+        big = street.rank is Rank.ARTERIAL or random.random() < 0.5
+        if not section.one_way and big and random.random() < 0.55 and sides:
             _open_left_bays(random, section, station, before, after, sides)
         elif big and random.random() < 0.2:
             _open_right_bay(random, section, station, before, after, sides)
@@ -53,10 +54,19 @@ def _end_lane(random: Generator, section: CrossSection, length: float) -> None:
     lanes = [strip for strip in side if strip.use in (Use.LANE, Use.BUS)]
     if len(lanes) < 2:
         return
-    taper = float(random.uniform(15.0, 45.0))
+    taper = float(random.uniform(12.0, 35.0))
     at = float(random.uniform(0.25, 0.75)) * length
     added = (-lanes[-1].width, 0.0) if random.random() < 0.5 else (0.0, -lanes[-1].width)
     lanes[-1].changes.append(ramp((at, added[0]), (at + taper, added[1])))
+
+
+def _vary_widths(random: Generator, section: CrossSection, length: float) -> None:
+    """Some lanes widen or narrow somewhere along the street."""
+    for strip in (*section.left, *section.right):
+        if strip.use is Use.LANE and random.random() < 0.4:
+            at, over = float(random.random()) * length, float(random.uniform(10.0, 45.0))
+            least = max(2.6 - strip.width, -0.8)
+            strip.changes.append(ramp((at, 0.0), (at + over, float(random.uniform(least, 1.4)))))
 
 
 def _bring_kerbs_forward(random: Generator, section: CrossSection, station: float) -> None:

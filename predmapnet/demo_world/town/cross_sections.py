@@ -116,10 +116,10 @@ def draw_section(random: Generator, rank: Rank, habits: Habits) -> CrossSection:
     """Draw the cross-section of a street."""
     if rank is Rank.ALLEY:
         return _draw_alley(random)
-    one_way = bool(random.random() < {Rank.ARTERIAL: 0.1, Rank.COLLECTOR: 0.2, Rank.LOCAL: 0.35}[rank])
+    one_way = bool(random.random() < {Rank.ARTERIAL: 0.08, Rank.COLLECTOR: 0.12, Rank.LOCAL: 0.25}[rank])
     shares = {
-        Rank.ARTERIAL: [0.1, 0.55, 0.35],
-        Rank.COLLECTOR: [0.55, 0.4, 0.05],
+        Rank.ARTERIAL: [0.25, 0.55, 0.2],
+        Rank.COLLECTOR: [0.7, 0.27, 0.03],
         Rank.LOCAL: [0.97, 0.03, 0.0],
     }[rank]
     right = 1 + int(random.choice(3, p=shares))

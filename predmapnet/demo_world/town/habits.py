@@ -46,13 +46,13 @@ class Habits:
 
     @classmethod
     def draw(cls, random: Generator) -> Habits:
-        """Draw the habits of a town: two thirds paint the centre yellow, a sixth drive on the left."""
+        """Draw the habits of a town: three quarters paint the centre yellow, a sixth drive on the left."""
         styles = list(CrossingStyle)
         first, second = styles[random.choice(3, p=[0.35, 0.3, 0.35])], styles[random.integers(3)]
         reaches_over = random.random() < 0.6
         return cls(
             left_hand=bool(random.random() < 0.17),
-            centre_colour="yellow" if random.random() < 0.65 else "white",
+            centre_colour="yellow" if random.random() < 0.75 else "white",
             crossing_styles=(first, first, second),
             ring_share=float(random.uniform(0.25, 0.75)),
             bare_share=float(random.uniform(0.1, 0.4)),
@@ -61,7 +61,7 @@ class Habits:
             walkway_width=float(random.uniform(1.6, 3.6)),
             grass_share=float(random.uniform(0.0, 0.5)),
             edge_line_share=float(random.uniform(0.0, 0.5)),
-            unmarked_share=float(random.uniform(0.3, 0.9)),
+            unmarked_share=float(random.uniform(0.2, 0.7)),
             lane_width=float(random.uniform(2.9, 3.5)),
             stop_line_share=float(random.uniform(0.2, 0.9)),
         )

@@ -41,7 +41,13 @@ def mirrored_map(vector_map: VectorMap) -> VectorMap:
             for crossing in vector_map.crossings
         ),
         dividers=tuple(replace(divider, points=mirrored(divider.points)) for divider in vector_map.dividers),
-        walkways=tuple(map(_polygon, vector_map.walkways)),
+        # Walkways have needles that rounding can turn over.
+        walkways=tuple(
+            part
+            for walkway in vector_map.walkways
+            for part in shapely.get_parts(shapely.make_valid(_polygon(walkway)))
+            if part.geom_type == "Polygon"
+        ),
         parking=tuple(map(_polygon, vector_map.parking)),
         stop_lines=tuple(map(_polygon, vector_map.stop_lines)),
         lane_paths=tuple(map(mirrored, vector_map.lane_paths)),
