@@ -10,6 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import shapely
 
 from predmapnet.demo_world.town.driving import KEY_FRAMES
 from predmapnet.demo_world.town.routes import drive
@@ -28,6 +29,9 @@ SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "tes
 
 FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
 """Scenes of the first world that are kept, so that networks can be compared with older ones."""
+
+SHORTEST_DRIVE = 60.0
+"""Metres that the car covers in every scene."""
 
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """How often each look is drawn for a training scene."""
@@ -99,9 +103,24 @@ def look_of(name: str) -> Look:
 
 
 @lru_cache(maxsize=32)
+def _town_and_drive(number: int) -> tuple[Town, Trajectory]:
+    """The first town of a seed in which there is a drive; a plan can be too cramped for its streets or for a car."""
+    mishap: Exception | None = None
+    for attempt in range(8):
+        try:
+            town = build_town(number, attempt)
+            driven = drive(town, number)
+        except (RuntimeError, ValueError, IndexError, shapely.GEOSException) as error:
+            mishap = error
+            continue
+        if np.linalg.norm(np.diff(driven.ego_to_global[:, :2, 3], axis=0), axis=1).sum() > SHORTEST_DRIVE:
+            return town, driven
+    raise RuntimeError(f"no town of seed {number} has a drive") from mishap
+
+
 def town_of(name: str) -> Town:
     """The town that a scene drives through."""
-    return build_town(scene_number(name))
+    return _town_and_drive(scene_number(name))[0]
 
 
 def vector_map(name: str) -> VectorMap:
@@ -111,7 +130,7 @@ def vector_map(name: str) -> VectorMap:
 
 def trajectory(name: str) -> Trajectory:
     """Where the car is at each key frame of a scene."""
-    return drive(town_of(name), scene_number(name))
+    return _town_and_drive(scene_number(name))[1]
 
 
 def build_world(name: str, edition: int = WORLD_VERSION) -> World:

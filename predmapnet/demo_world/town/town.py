@@ -86,9 +86,9 @@ def _distance(reach: ArmReach, of: str) -> float:
     return reach.stop if of == "stop" else reach.paint
 
 
-def build_town(seed: int) -> Town:
-    """Build a town of roughly 400 x 400 m. The same seed gives the same town."""
-    random = np.random.default_rng([0x746F776E32, seed])
+def build_town(seed: int, attempt: int = 0) -> Town:
+    """Build a town of roughly 400 x 400 m. The same seed and attempt give the same town."""
+    random = np.random.default_rng([0x746F776E32, seed, attempt])
     habits = Habits.draw(random)
     plan = plan_streets(random)
     sections = [draw_section(random, street.rank, habits) for street in plan.streets]
