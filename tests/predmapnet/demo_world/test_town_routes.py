@@ -89,7 +89,8 @@ def test_drives_turn_stop_and_never_see_the_end_of_the_world(drives):
         )
         ends = mirrored(ends) if town.vector_map.left_hand else ends
         gaps = np.linalg.norm(drive.ego_to_global[:, None, :2, 3] - ends, axis=2)
-        assert gaps.min() > 38.0
+        # The corner of the region of interest lies 33.5 m from its middle.
+        assert gaps.min() > 34.0
 
 
 def test_there_is_enough_to_see_around_the_car(drives):
