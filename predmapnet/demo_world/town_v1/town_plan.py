@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from predmapnet.demo_world.town.roads import CrossSection, Road, road_through
+from predmapnet.demo_world.town_v1.roads import CrossSection, Road, road_through
 from predmapnet.demo_world.world import LineStyle
 
 Float = NDArray[np.float64]
