@@ -18,7 +18,7 @@ from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, draw_balls, draw_faces, draw_mask
 from predmapnet.demo_world.render.response import Response
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
-from predmapnet.demo_world.street.looks import light_of
+from predmapnet.demo_world.street.looks import Light, light_of
 from predmapnet.demo_world.world import Solids, World
 from predmapnet.scenes import Camera, Rig
 
@@ -77,7 +77,8 @@ class Renderer:
     Args:
         world: what to draw.
         supersampling: samples per pixel and direction along the edges of solids, 1 to 4.
-        response: how the cameras turn light into bytes.
+        response: how the cameras turn light into bytes; None takes well-exposed ones.
+        light: of the scene; None takes that of the world's look.
         texel: side of the finest ground texture's cells, metres.
         threads: cameras that :meth:`render_frame` draws at once. One for callers that run several processes.
     """
@@ -88,6 +89,7 @@ class Renderer:
         supersampling: int = 2,
         threads: int = 1,
         response: Response | None = None,
+        light: Light | None = None,
         texel: float = FINE_TEXEL,
     ) -> None:
         if not 1 <= supersampling <= 4:
@@ -95,7 +97,7 @@ class Renderer:
         self.world = world
         self.supersampling = supersampling
         self.threads = threads
-        self.light = light_of(world.look, world.seed)
+        self.light = light_of(world.look, world.seed) if light is None else light
         self._ground = paint_ground(world, self.light, texel)
         solids = world.solids
         self._moving = solids.velocity.any(axis=1) | ~solids.always

@@ -71,5 +71,5 @@ def draw_response(seed: int) -> Response:
         knee=float(generator.uniform(0.35, 0.95)),
         black=float(max(0.0, generator.normal(0.0, 0.03))),
         blur=float(generator.uniform(0.3, 1.1)),
-        noise=float(np.exp(generator.normal(0, 0.5))),
+        noise=float(np.exp(generator.normal(-0.3, 0.5))),
     )

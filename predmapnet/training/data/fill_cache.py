@@ -26,6 +26,8 @@ from predmapnet.training.data.scene_cache import write_scene
 if TYPE_CHECKING:
     from predmapnet.demo_world.render.renderer import Renderer
     from predmapnet.demo_world.render.response import Response
+    from predmapnet.demo_world.street.looks import Light
+    from predmapnet.demo_world.world import World
 
 DEMO = "demo"
 EDGE_SAMPLES = 2
@@ -108,13 +110,13 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
     from predmapnet.demo_world.rig import LIDAR_TO_EGO
 
     world = build_world(folder.name)
-    rig, response = _car(folder.name, config)
+    rig, response, light = _car_and_light(world, config)
     lift = np.eye(4)
     lift[2, 3] = -rig[0].ground_height
     world = replace(world, trajectory=replace(world.trajectory, ego_to_global=world.trajectory.ego_to_global @ lift))
     poses = world.trajectory.ego_to_global
     lidar_to_ego = inverse_pose(lift) @ LIDAR_TO_EGO
-    renderer = Renderer(world, supersampling=EDGE_SAMPLES, response=response, texel=TEXEL)
+    renderer = Renderer(world, supersampling=EDGE_SAMPLES, response=response, light=light, texel=TEXEL)
     images = _render(renderer, tuple(window_camera(camera, config) for camera in rig))
     truth = truth_from_vector_map(world.map)
     lidar_to_global = poses @ lidar_to_ego
@@ -133,21 +135,21 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
     write_scene(folder, rig, images, shifted, truths, lidar)
 
 
-def _car(name: str, config: PredMapNetConfig) -> tuple[Rig, Response]:
-    """The cameras of a demo scene, and how they expose."""
+def _car_and_light(world: World, config: PredMapNetConfig) -> tuple[Rig, Response, Light]:
+    """The cameras of a demo scene, how they expose, and the light of the scene."""
     from predmapnet.demo_world.catalogue import SPLITS, scene_number
     from predmapnet.demo_world.render.response import Response, draw_response
     from predmapnet.demo_world.rig import DEMO_RIG
     from predmapnet.demo_world.rigs import sample_rig
+    from predmapnet.demo_world.street.looks import harder_light, light_of
 
-    number = scene_number(name)
-    if number not in SPLITS["train"]:
-        rig, response = DEMO_RIG, Response()
-    else:
+    number, light = scene_number(world.name), light_of(world.look, world.seed)
+    rig, response = DEMO_RIG, Response()
+    if number in SPLITS["train"]:
         # MapTracker's view transform has learned where its six cameras sit.
         rig = sample_rig(number) if isinstance(config.bev, LookupBevConfig) else DEMO_RIG
-        response = draw_response(number)
-    return rig, replace(response, blur=float(np.hypot(response.blur, SCALING_BLUR)))
+        response, light = draw_response(number), harder_light(light, number)
+    return rig, replace(response, blur=float(np.hypot(response.blur, SCALING_BLUR))), light
 
 
 def _render(renderer: Renderer, cameras: Rig) -> NDArray[np.uint8]:
