@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 Images = NDArray[np.uint8]
 
@@ -109,7 +108,7 @@ def add_stray_light(
     return image
 
 
-def _blend(image: NDArray[np.uint8], other: Float, strength: Float32) -> NDArray[np.uint8]:
+def _blend(image: NDArray[np.uint8], other: NDArray[np.floating], strength: Float32) -> NDArray[np.uint8]:
     mixed = image + strength[:, :, None] * (other - image)
     return np.clip(mixed, 0, 255).astype(np.uint8)
 
@@ -136,18 +135,19 @@ def _shadow_mask(height: int, width: int, generator: np.random.Generator) -> NDA
         if kind < 0.5:
             # Of a pole or a wire: it widens towards the camera.
             thick = generator.uniform(0.01, 0.12) * width
-            shape = [[far, horizon], [far + 0.1 * thick, horizon], [near + thick, height], [near, height]]
+            corners = [[far, horizon], [far + 0.1 * thick, horizon], [near + thick, height], [near, height]]
+            outline = np.array(corners)
         elif kind < 0.8:
             # Of a wall: a whole strip across the road.
             top, bottom = horizon + np.sort(generator.uniform(0.05, 0.9, 2)) * (height - horizon)
             tilt = generator.uniform(-0.3, 0.3, 2) * (height - horizon)
-            shape = [[0, top], [width, top + tilt[0]], [width, bottom + tilt[1]], [0, bottom]]
+            outline = np.array([[0, top], [width, top + tilt[0]], [width, bottom + tilt[1]], [0, bottom]])
         else:
             middle = np.array([near, horizon + generator.uniform(0.1, 1.0) * (height - horizon)])
             angles = np.sort(generator.uniform(0, 2 * np.pi, 9))
             radius = generator.uniform(0.05, 0.3, 9) * width
-            shape = middle + np.stack([np.cos(angles) * radius, 0.4 * np.sin(angles) * radius], axis=1)
-        cv2.fillPoly(mask, [np.round(np.array(shape)).astype(np.int32)], left, cv2.LINE_AA)
+            outline = middle + np.stack([np.cos(angles) * radius, 0.4 * np.sin(angles) * radius], axis=1)
+        cv2.fillPoly(mask, [np.round(outline).astype(np.int32)], left, cv2.LINE_AA)
     return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if generator.random() < 0.5 else mask
 
 
