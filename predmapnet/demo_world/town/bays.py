@@ -8,7 +8,6 @@ from numpy.random import Generator
 from predmapnet.demo_world.town.cross_sections import CrossSection, Strip, Use, ramp
 from predmapnet.demo_world.town.street_plan import Rank, StreetPlan
 
-FAR = 1e4
 SUDDEN = 0.01
 """A change at a node happens within this length, hidden in the junction, metres."""
 
@@ -83,59 +82,74 @@ def _bring_kerbs_forward(random: Generator, section: CrossSection, station: floa
             )  # fmt: skip
 
 
+def _bay_knots(station: float, back: int, hold: float, taper: float, width: float) -> tuple[tuple[float, float], ...]:
+    """(Station, width) of a bay that opens over ``taper`` metres and lasts ``hold`` metres up to a node."""
+    start = station + back * hold
+    return (start + back * taper, 0.0), (start, width), (station, width), (station - back * SUDDEN, 0.0)
+
+
 def _open_left_bays(
     random: Generator, section: CrossSection, station: float, before: float, after: float, sides: set[int]
 ) -> None:
     """Bays for left turns before a node, from either direction, in or beside the middle of the street."""
     width = float(random.uniform(2.7, 3.3))
     base = section.middle[len(section.middle) // 2]
-    room = max(base.width - (0.7 if base.use is Use.RAISED else 0.0), 0.0)
     if base.use is Use.TURNS:
         width = base.width
-    taken = min(room, width) if base.use is not Use.GAP or room > 0 else 0.0
+    taken = min(max(base.width - (0.7 if base.use is Use.RAISED else 0.0), 0.0), width)
     for direction, length in ((1, before), (-1, after)):
         taper = float(random.uniform(10.0, 28.0))
         hold = float(random.uniform(12.0, 45.0))
-        if length > 20.0 and length < 2 * (taper + hold) + 14.0:
-            hold, taper = max(0.5 * length - 22.0, 4.0), 12.0
         if length <= 20.0:
             continue
+        if length < 2 * (taper + hold) + 14.0:
+            hold, taper = max(0.5 * length - 22.0, 4.0), 12.0
         # A car going +1 turns left where an arm joins on the left.
         if direction in sides:
-            hatched = base.use is Use.GAP and taken == 0.0 and random.random() < 0.5
-            bay = Strip(Use.LANE, direction, 0.0)
-            back = -direction
-            start = station + back * hold
-            if hatched:
-                opening = float(random.uniform(5.0, 9.0))
-                bay.changes.append(
-                    ramp(
-                        (start + back * opening, 0.0), (start, width), (station, width), (station - back * SUDDEN, 0.0)
-                    )
-                )
-                base.changes.append(
-                    ramp((start + back * (opening + taper), 0.0), (start + back * opening, width), (start, 0.0))
-                )
-            else:
-                knots = ((start + back * taper, 0.0), (start, width), (station, width), (station - back * SUDDEN, 0.0))
-                bay.changes.append(ramp(*knots))
-                if taken > 0:
-                    base.changes.append(ramp(*((at, -taken * added / width) for at, added in knots)))
-            section.middle.insert(len(section.middle) if direction == 1 else 0, bay)
+            strip = _left_bay(random, base, (station, -direction, hold, taper, width), taken)
         elif taken < width - 0.1:
-            # Nothing to turn into: the space closes again, hatched.
-            gap = Strip(Use.GAP, 0, 0.0)
-            grown = width - taken
-            away = -direction
-            gap.changes.append(
-                ramp(
-                    (station - away * SUDDEN, 0.0),
-                    (station, grown),
-                    (station + away * 2.0, grown),
-                    (station + away * (taper + 8.0), 0.0),
-                )
-            )
-            section.middle.insert(len(section.middle) if direction == 1 else 0, gap)
+            strip = _closing_gap(station, -direction, taper, width - taken)
+        else:
+            continue
+        section.middle.insert(len(section.middle) if direction == 1 else 0, strip)
+
+
+def _left_bay(random: Generator, base: Strip, bay: tuple[float, int, float, float, float], taken: float) -> Strip:
+    """A bay for left turns that takes its width from the middle, or opens beside a hatched taper.
+
+    Args:
+        random: decides whether the taper is hatched.
+        base: what is in the middle of the street; it gives way.
+        bay: station of the node, direction back from it, length, taper and width of the bay.
+        taken: width that the bay takes from ``base``, metres.
+    """
+    station, back, hold, taper, width = bay
+    strip = Strip(Use.LANE, -back, 0.0)
+    if base.use is Use.GAP and taken == 0.0 and random.random() < 0.5:
+        opening = float(random.uniform(5.0, 9.0))
+        strip.changes.append(ramp(*_bay_knots(station, back, hold, opening, width)))
+        start = station + back * hold
+        base.changes.append(
+            ramp((start + back * (opening + taper), 0.0), (start + back * opening, width), (start, 0.0))
+        )
+        return strip
+    knots = _bay_knots(station, back, hold, taper, width)
+    strip.changes.append(ramp(*knots))
+    if taken > 0:
+        base.changes.append(ramp(*((at, -taken * added / width) for at, added in knots)))
+    return strip
+
+
+def _closing_gap(station: float, away: int, taper: float, width: float) -> Strip:
+    """The hatched gap beyond a node at which nothing can be turned into: the space of the bay closes again."""
+    gap = Strip(Use.GAP, 0, 0.0)
+    gap.changes.append(
+        ramp(
+            (station - away * SUDDEN, 0.0), (station, width), (station + away * 2.0, width),
+            (station + away * (taper + 8.0), 0.0),
+        )
+    )  # fmt: skip
+    return gap
 
 
 def _open_right_bay(
@@ -149,9 +163,8 @@ def _open_right_bay(
         return
     width, back = float(random.uniform(2.7, 3.3)), -direction
     hold, taper = float(random.uniform(12.0, 0.5 * length - 12.0)), float(random.uniform(6.0, 18.0))
-    start = station + back * hold
     bay = Strip(Use.LANE, direction, 0.0)
-    knots = ((start + back * taper, 0.0), (start, width), (station, width), (station - back * SUDDEN, 0.0))
+    knots = _bay_knots(station, back, hold, taper, width)
     bay.changes.append(ramp(*knots))
     outer = side[-1]
     if outer.use is Use.PARKING:

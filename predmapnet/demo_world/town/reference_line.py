@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -35,10 +36,15 @@ class ReferenceLine:
         """Metres."""
         return float(self.stations[-1])
 
-    @property
+    @cached_property
     def shape(self) -> shapely.LineString:
         """The line itself."""
         return shapely.LineString(self.points)
+
+    @cached_property
+    def surroundings(self) -> Polygon:
+        """The ground within 14 m of the line, which the yards of other streets keep clear of."""
+        return self.shape.buffer(14.0)
 
     def direction(self, stations: Float) -> Float:
         """Unit tangents ``(n, 2)`` at stations ``(n,)``."""

@@ -32,6 +32,10 @@ class _Line(NamedTuple):
     opposite: bool
 
 
+_Runs = dict[int, tuple[list[_Line | None], Float]]
+"""Lines by name: what they are at each station, and their lateral offsets there."""
+
+
 def paint_street(
     random: Generator,
     line: ReferenceLine,
@@ -57,42 +61,52 @@ def paint_street(
     Returns:
         Dividers, and lines that are no dividers.
     """
-    count = max(2, round((end - start) / SPACING) + 1)
-    stations = np.linspace(start, end, count)
-    edges = section.edges(stations)
-    strips = section.strips
-    active = -np.diff(edges, axis=0) > ACTIVE
-    runs: dict[int, list[_Line | None]] = {}
-    places: dict[int, Float] = {}
-    for column in range(count):
-        rows = np.flatnonzero(active[:, column])
-        for upper, lower in pairwise(rows.tolist()):
-            kind = _kind(section, strips[upper], strips[lower], stations[column], stops, habits)
-            if kind is None:
-                continue
-            key = _key(section, int(upper), int(lower))
-            runs.setdefault(key, [None] * count)[column] = kind
-            places.setdefault(key, np.zeros(count))[column] = (edges[upper + 1, column] + edges[lower, column]) / 2
+    stations = np.linspace(start, end, max(2, round((end - start) / SPACING) + 1))
+    runs = _lines_between_strips(section, stations, stops, habits)
     if section.edge_line:
-        for key, row, sign in ((-1, 0, -1.0), (-2, -1, 1.0)):
-            outer = strips[0 if row == 0 else -1]
-            if outer.use is not Use.PARKING:
-                colour = habits.centre_colour if section.one_way and row == 0 else "white"
-                runs[key] = [_Line(False, LineStyle.SOLID, colour, False)] * count
-                places[key] = edges[row] + sign * 0.35
+        runs |= _edge_lines(section, stations, habits)
     dividers: list[Divider] = []
     markings: list[Divider] = []
-    for key, kinds in runs.items():
+    for kinds, offsets in runs.values():
         for first, last in _stretches(kinds):
-            kind = kinds[first]
+            kind, part = kinds[first], slice(first, last + 1)
             assert kind is not None
             if stations[last] - stations[first] < SHORTEST:
                 continue
-            points = line.locate(stations[first : last + 1], places[key][first : last + 1])
-            changes = _changes(kinds[first : last + 1], stations[first : last + 1])
+            points = line.locate(stations[part], offsets[part])
+            changes = _changes(kinds[part], stations[part])
             drawn = Divider(points, kind.style, kind.colour, kind.opposite, changes)
             (dividers if kind.is_divider else markings).append(drawn)
     return dividers, markings
+
+
+def _lines_between_strips(section: CrossSection, stations: Float, stops: tuple[float, float], habits: Habits) -> _Runs:
+    """Lines between neighbouring strips, by name."""
+    edges = section.edges(stations)
+    strips = section.strips
+    active = -np.diff(edges, axis=0) > ACTIVE
+    runs: _Runs = {}
+    for column, station in enumerate(stations):
+        for upper, lower in pairwise(np.flatnonzero(active[:, column]).tolist()):
+            kind = _kind(section, strips[upper], strips[lower], station, stops, habits)
+            if kind is None:
+                continue
+            kinds, offsets = runs.setdefault(
+                _key(section, upper, lower), ([None] * len(stations), np.zeros(len(stations)))
+            )
+            kinds[column], offsets[column] = kind, (edges[upper + 1, column] + edges[lower, column]) / 2
+    return runs
+
+
+def _edge_lines(section: CrossSection, stations: Float, habits: Habits) -> _Runs:
+    """Lines along both kerbs, unless cars are parked there."""
+    edges = section.edges(stations)
+    runs: _Runs = {}
+    for key, row, sign in ((-1, 0, -1.0), (-2, -1, 1.0)):
+        if section.strips[row].use is not Use.PARKING:
+            colour = habits.centre_colour if section.one_way and row == 0 else "white"
+            runs[key] = [_Line(False, LineStyle.SOLID, colour, False)] * len(stations), edges[row] + sign * 0.35
+    return runs
 
 
 def _key(section: CrossSection, upper: int, lower: int) -> int:
