@@ -6,17 +6,15 @@ import difflib
 import os
 import re
 import sys
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
-import shapely
 
+from predmapnet.demo_world.first_towns import first_town
 from predmapnet.demo_world.town.driving import KEY_FRAMES
-from predmapnet.demo_world.town.routes import drive
+from predmapnet.demo_world.town.routes import NoDriveError, drive
 from predmapnet.demo_world.town.town import Town, build_town
-from predmapnet.demo_world.town_v1.routes import drive as drive_first
-from predmapnet.demo_world.town_v1.town import build_town as build_first_town
 from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
@@ -29,9 +27,6 @@ SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "tes
 
 FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
 """Scenes of the first world that are kept, so that networks can be compared with older ones."""
-
-SHORTEST_DRIVE = 60.0
-"""Metres that the car covers in every scene."""
 
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """How often each look is drawn for a training scene."""
@@ -78,11 +73,17 @@ def scene_infos(split: str | None = None, edition: int = WORLD_VERSION) -> tuple
 
 def scene_number(name: str, edition: int = WORLD_VERSION) -> int:
     """The number of a scene, which is the seed of its town. Raises UserError for a name that does not exist."""
-    names = {f"scene-{number:04d}": number for numbers in splits_of(edition).values() for number in numbers}
+    names = _numbers(edition)
     if name not in names:
         near = ", ".join(_nearest_names(name, names))
         raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {near}.")
     return names[name]
+
+
+@cache
+def _numbers(edition: int) -> dict[str, int]:
+    """Scene numbers of an edition by name."""
+    return {f"scene-{number:04d}": number for numbers in splits_of(edition).values() for number in numbers}
 
 
 def _nearest_names(name: str, names: dict[str, int]) -> list[str]:
@@ -105,17 +106,13 @@ def look_of(name: str) -> Look:
 @lru_cache(maxsize=32)
 def _town_and_drive(number: int) -> tuple[Town, Trajectory]:
     """The first town of a seed in which there is a drive; a plan can be too cramped for its streets or for a car."""
-    mishap: Exception | None = None
     for attempt in range(8):
+        town = build_town(number, attempt)
         try:
-            town = build_town(number, attempt)
-            driven = drive(town, number)
-        except (RuntimeError, ValueError, IndexError, shapely.GEOSException) as error:
-            mishap = error
+            return town, drive(town, number)
+        except NoDriveError:
             continue
-        if np.linalg.norm(np.diff(driven.ego_to_global[:, :2, 3], axis=0), axis=1).sum() > SHORTEST_DRIVE:
-            return town, driven
-    raise RuntimeError(f"no town of seed {number} has a drive") from mishap
+    raise NoDriveError(f"no town of seed {number} has a drive")
 
 
 def town_of(name: str) -> Town:
@@ -139,8 +136,7 @@ def build_world(name: str, edition: int = WORLD_VERSION) -> World:
 
     number = scene_number(name, edition)
     if edition == 1:
-        first = build_first_town(number)
-        return dress(first.vector_map, drive_first(first, number), look_of(name), number, name)
+        return dress(*first_town(number), look_of(name), number, name)
     return dress(vector_map(name), trajectory(name), look_of(name), number, name)
 
 

@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ from shapely import LineString, Polygon
 
 from predmapnet.datasets.ground_truth.map_file import read_map
 from predmapnet.demo_world.av2_dressing import vector_map_of
-from predmapnet.demo_world.catalogue import vector_map
-from predmapnet.demo_world.town_v1.town import build_town as build_first_town
+from predmapnet.demo_world.catalogue import FIRST_SPLITS, vector_map
+from predmapnet.demo_world.first_towns import first_town
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 
 Float = NDArray[np.float64]
@@ -68,12 +69,15 @@ def crossing_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
     """Measures of crossings: how they meet, how long, deep and skewed they are, how many."""
     touching: list[bool] = []
     on_curve: list[bool] = []
-    lengths, depths, fill, off = [], [], [], []
+    lengths, depths, fill, off, gaps, aslant = [], [], [], [], [], []
     for town, road in zip(maps, roads, strict=True):
         shapes = [crossing.polygon for crossing in town.crossings]
+        paths = shapely.STRtree([LineString(path) for path in town.lane_paths])
         for index, shape in enumerate(shapes):
             others = shapes[:index] + shapes[index + 1 :]
-            touching.append(min((shape.distance(other) for other in others), default=99.0) < 0.5)
+            gap = min((shape.distance(other) for other in others), default=99.0)
+            touching.append(gap < 0.5)
+            gaps.append(gap)
             box = np.asarray(shape.minimum_rotated_rectangle.exterior.coords)
             sides = sorted(np.linalg.norm(np.diff(box[:3], axis=0), axis=1).tolist())
             depths.append(sides[0])
@@ -81,16 +85,36 @@ def crossing_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
             fill.append(100 * shape.area / (sides[0] * sides[1]))
             off.append(100 * shape.difference(road).area / shape.area)
             on_curve += _ends_on_curve(box, road)
+            aslant += _off_square(shape, box, paths)
     area = sum(road.area for road in roads) / 1e4
     return {
         "crossings touching another (< 0.5 m), %": share(touching),
         "crossing ends on a curved kerb, %": share(on_curve),
         "crossing length p10/50/90, m": percentiles(lengths),
         "crossing depth p10/50/90, m": percentiles(depths),
+        "crossing off square to the nearest lane p50/90, degrees": _two(aslant),
+        "gap to the next crossing, median, m": f"{np.median(gaps):.1f}" if gaps else "-",
         "crossing area / its rectangle, median, %": f"{np.median(fill):.0f}" if fill else "-",
         "crossing area off the road, median, %": f"{np.median(off):.0f}" if off else "-",
         "crossings per hectare of road": f"{len(lengths) / area:.1f}",
     }
+
+
+def _two(values: list[float]) -> str:
+    return "/".join(f"{value:.1f}" for value in np.percentile(values, [50, 90])) if values else "-"
+
+
+def _off_square(shape: Polygon, box: Float, paths: shapely.STRtree) -> list[float]:
+    """Angle between a crossing's longer axis and the normal of the lane nearest to it, degrees; none beyond 15 m."""
+    near = paths.query_nearest(shape.centroid, max_distance=15.0, all_matches=False)
+    if not len(near):
+        return []
+    path = paths.geometries[near[0]]
+    at = min(max(path.project(shape.centroid), 1.0), path.length - 1.0)
+    first, last = np.diff(box[:3], axis=0)
+    along = first if np.linalg.norm(first) > np.linalg.norm(last) else last
+    angle = abs(float(np.arctan2(along[1], along[0])) - _heading(path, at)) % np.pi
+    return [abs(90.0 - float(np.degrees(angle)))]
 
 
 def _ends_on_curve(box: Float, road: shapely.Geometry) -> list[bool]:
@@ -135,6 +159,89 @@ def lane_row(maps: list[VectorMap]) -> Row:
         "lane width p10/50/90 (deviation), m": f"{percentiles(widths)} ({np.std(widths):.2f})" if widths else "-",
         "lane paths with a radius under 200 m, %": f"{weighted:.0f}",
     }
+
+
+def street_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
+    """Measures of streets, looked at across a lane every 20 m: lanes each way, medians; and lanes that open or close."""
+    same, opposite, medians = [], [], []
+    ends, length = 0, 0.0
+    for town, road in zip(maps, roads, strict=True):
+        shapely.prepare(road)
+        lines = [LineString(path) for path in town.lane_paths]
+        tree, lanes = shapely.STRtree(lines), shapely.STRtree(town.lanes)
+        for line, lane in zip(lines, town.lanes, strict=False):
+            length += line.length / 1000
+            ends += sum(_narrow(lane, line, at) for at in (1.0, line.length - 1.0) if line.length > 12.0)
+            for at in np.arange(10.0, line.length - 5.0, 20.0):
+                ahead, against, between = _across(line, at, lines, tree)
+                same.append(ahead)
+                opposite.append(against)
+                if between is not None:
+                    free = between.difference(shapely.union_all([town.lanes[row] for row in lanes.query(between)]))
+                    medians.append("" if free.length < 0.4 else ("paint" if road.covers(free) else "raised"))
+    counts, others = np.array(same), np.array(opposite)
+    if not same:
+        return dict.fromkeys(STREET_MEASURES, "-")
+    two_way = others > 0
+    values = (
+        "/".join(f"{100 * np.mean(counts == n if n < 4 else counts > 3):.0f}" for n in (1, 2, 3, 4)),
+        f"{100 * np.mean(~two_way):.0f}",
+        f"{100 * np.mean(counts[two_way] != others[two_way]):.0f}" if two_way.any() else "-",
+        f"{ends / length:.1f}",
+        " / ".join(share([median == kind for median in medians]) for kind in ("raised", "paint")),
+    )
+    return dict(zip(STREET_MEASURES, values, strict=True))
+
+
+STREET_MEASURES = (
+    "lanes per direction 1/2/3/4+, %",
+    "one-way, %",
+    "unequal lanes per direction where two-way, %",
+    "lanes that open or close (an end under 1.8 m wide) per lane km",
+    "raised median / painted gap between directions, %",
+)
+
+
+def _normal(line: LineString, at: float, reach: float) -> tuple[LineString, Float]:
+    """A straight across a line, and the direction of the line there."""
+    heading = _heading(line, at)
+    ahead = np.array([np.cos(heading), np.sin(heading)])
+    here = shapely.get_coordinates(line.interpolate(at))[0]
+    aside = reach * np.array([-ahead[1], ahead[0]])
+    return LineString([here - aside, here + aside]), ahead
+
+
+def _narrow(lane: Polygon, line: LineString, at: float) -> bool:
+    return bool(lane.intersection(_normal(line, at, 4.0)[0]).length < 1.8)
+
+
+def _across(
+    line: LineString, at: float, lines: list[LineString], tree: shapely.STRtree
+) -> tuple[int, int, LineString | None]:
+    """Lanes beside a place of a lane in its own and in the other direction, and the way between the directions."""
+    cut, ahead = _normal(line, at, 25.0)
+    found: list[tuple[float, bool]] = []
+    for row in tree.query(cut, predicate="intersects"):
+        for place in shapely.get_parts(cut.intersection(lines[row])):
+            if place.geom_type == "Point":
+                other = _normal(lines[row], lines[row].project(place), 1.0)[1]
+                if abs(other @ ahead) > 0.94:
+                    found.append((cut.project(place), bool(other @ ahead > 0)))
+    found.sort()
+    here = min(range(len(found)), key=lambda index: abs(found[index][0] - 25.0))
+    first = last = here
+    # Neighbours lie within 8 m: a lane and a median.
+    while first > 0 and found[first][0] - found[first - 1][0] < 8.0:
+        first -= 1
+    while last + 1 < len(found) and found[last + 1][0] - found[last][0] < 8.0:
+        last += 1
+    street = found[first : last + 1]
+    turns = [(a, b) for (a, ahead_a), (b, ahead_b) in pairwise(street) if ahead_a != ahead_b]
+    between = None
+    if len(turns) == 1:
+        between = LineString([cut.interpolate(station) for station in turns[0]])
+    count = sum(is_ahead for _, is_ahead in street)
+    return count, len(street) - count, between
 
 
 def paint_row(maps: list[VectorMap]) -> Row:
@@ -225,14 +332,14 @@ def kerb_row(roads: list[shapely.Geometry]) -> Row:
 def measure(maps: list[VectorMap]) -> Row:
     """All measures of some maps."""
     roads = [shapely.union_all([part.buffer(0.02, join_style="mitre") for part in town.road_segments]) for town in maps]
-    return crossing_row(maps, roads) | lane_row(maps) | paint_row(maps) | kerb_row(roads)
+    return crossing_row(maps, roads) | street_row(maps, roads) | lane_row(maps) | paint_row(maps) | kerb_row(roads)
 
 
 def sources(towns: int) -> Iterator[tuple[str, Callable[[], list[VectorMap]]]]:
     """Names of the sources that are there, and how to read them."""
     root = Path(os.environ.get("PREDMAPNET_REFERENCE", Path(__file__).parents[3] / "shared/reference/public"))
     yield "new towns", lambda: [vector_map(f"scene-{number:04d}") for number in range(201, 201 + towns)]
-    yield "old towns", lambda: [build_first_town(number).vector_map for number in range(201, 201 + towns)]
+    yield "old towns", lambda: [first_town(number)[0] for number in FIRST_SPLITS["test"]]
     archives = sorted((root / "ground_truth/av2/logs").glob("*/map/log_map_archive_*.json"))
     if archives:
         yield "Argoverse 2", lambda: [vector_map_of(read_map(path)[0]) for path in archives]

@@ -21,53 +21,58 @@ Float = NDArray[np.float64]
 
 
 def furnish(
-    random: Generator, plan: StreetPlan, section: CrossSection, stretch: Stretch, habits: Habits, works: Works
+    random: Generator,
+    plan: StreetPlan,
+    section: CrossSection,
+    stretches: list[Stretch],
+    habits: Habits,
+    works: Works,
 ) -> None:
-    """Everything of a stretch that is not paint: medians, openings, lay-bys, lanes."""
-    street = plan.streets[stretch.street]
-    line = street.line
-    begin, finish = stretch.inner("stop")
-    clear = stretch.inner("clear")
-    if finish - begin > 8.0:
-        works.islands += median_islands(random, line, section, begin + 0.5, finish - 0.5)
-        for row, strip in enumerate(section.strips):
-            inner = spaced(begin + 3.0, finish - 3.0) if finish - begin > 16.0 else None
-            if inner is not None and (strip.use is Use.PARKING or strip.parked):
-                works.parking += _parking_places(line, section, row, inner)
-    low, high = clear[0] + 3.0, clear[1] - 3.0
-    if high - low > 8.0:
-        own = line.shape.buffer(section.half_width + 0.2)
-        others = [other.line.surroundings for number, other in enumerate(plan.streets) if number != stretch.street]
-        taken = shapely.union_all(others)
-        shapely.prepare(taken)
-        rate = habits.openings * float(random.choice([0.4, 1.0, 2.0]))
-        openings = build_openings(random, line, section, low, high, rate, taken)
-        works.paved += [piece for piece in openings if piece.area > 1.0 and not piece.within(own)]
-        lay_bys = build_lay_bys(random, line, section, low, high)
-        works.paved += lay_bys.paved
-        works.parking += lay_bys.parking
-        for sign in (1, -1):
-            if random.random() < habits.grass_share:
-                kerb = section.edges(np.array([low, high]))[0 if sign == 1 else -1]
-                rim = kerb + sign * 5.0
-                works.grass.append(line.band(np.array([low, high]), np.minimum(kerb, rim), np.maximum(kerb, rim)))
-    _lay_lanes(line, section, stretch, street.rank is not Rank.ALLEY, works)
+    """Build everything of one street that is not paint: medians, openings, lay-bys, lanes."""
+    index = stretches[0].street
+    line, rank = plan.streets[index].line, plan.streets[index].rank
+    own = line.shape.buffer(section.half_width + 0.2)
+    taken = shapely.union_all([street.line.surroundings for n, street in enumerate(plan.streets) if n != index])
+    shapely.prepare(taken)
+    for stretch in stretches:
+        begin, finish = stretch.inner("stop")
+        low, high = stretch.inner("clear")
+        low, high = low + 3.0, high - 3.0
+        if finish - begin > 8.0:
+            works.islands += median_islands(random, line, section, begin + 0.5, finish - 0.5)
+        if finish - begin > 16.0:
+            works.parking += _parking_places(line, section, spaced(begin + 3.0, finish - 3.0))
+        if high - low > 8.0:
+            rate = habits.openings * float(random.choice([0.4, 1.0, 2.0]))
+            openings = build_openings(random, line, section, low, high, rate, taken)
+            works.paved += [piece for piece in openings if piece.area > 1.0 and not piece.within(own)]
+            lay_bys = build_lay_bys(random, line, section, low, high)
+            works.paved += lay_bys.paved
+            works.parking += lay_bys.parking
+            for sign in (1, -1):
+                if random.random() < habits.grass_share:
+                    kerb = section.edges(np.array([low, high]))[0 if sign == 1 else -1]
+                    rim = kerb + sign * 5.0
+                    works.grass.append(line.band(np.array([low, high]), np.minimum(kerb, rim), np.maximum(kerb, rim)))
+        _lay_lanes(line, section, stretch, rank is not Rank.ALLEY, works)
 
 
-def _parking_places(line: ReferenceLine, section: CrossSection, row: int, stations: Float) -> list[Polygon]:
-    """Where cars are parked in one strip, in pieces short enough to be straight."""
+def _parking_places(line: ReferenceLine, section: CrossSection, stations: Float) -> list[Polygon]:
+    """Where cars are parked, in pieces short enough to be straight."""
     edges = section.edges(stations)
-    width = section.strips[row].parked or 0.0
-    high, low = edges[row], edges[row + 1]
-    if width:
-        on_left = row == 0 and len(section.strips) > 1
-        high, low = (high, high - width) if on_left else (low + width, low)
-    wide = (high - low) > 1.7
     found = []
-    for first in range(0, len(stations) - 1, 12):
-        last = min(first + 12, len(stations) - 1)
-        if last > first and wide[first : last + 1].all():
-            found.append(line.band(stations[first : last + 1], low[first : last + 1], high[first : last + 1]))
+    for row, strip in enumerate(section.strips):
+        high, low = edges[row], edges[row + 1]
+        if strip.parked:
+            on_left = row == 0 and len(section.strips) > 1
+            high, low = (high, high - strip.parked) if on_left else (low + strip.parked, low)
+        elif strip.use is not Use.PARKING:
+            continue
+        wide = (high - low) > 1.7
+        for first in range(0, len(stations) - 1, 12):
+            last = min(first + 12, len(stations) - 1)
+            if wide[first : last + 1].all():
+                found.append(line.band(stations[first : last + 1], low[first : last + 1], high[first : last + 1]))
     return found
 
 

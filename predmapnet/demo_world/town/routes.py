@@ -26,6 +26,9 @@ from predmapnet.demo_world.world import Trajectory
 
 Float = NDArray[np.float64]
 
+SHORTEST_DRIVE = 60.0
+"""Metres that the car covers in every scene."""
+
 LONG_ENOUGH = 260.0
 """Metres of path that are enough for a drive."""
 
@@ -39,6 +42,10 @@ HALF_CAR = 0.85
 """Half of the width between the wheels, metres."""
 
 
+class NoDriveError(Exception):
+    """A town without a drive: its plan is too cramped for a car to get anywhere."""
+
+
 def drive(town: Town, seed: int) -> Trajectory:
     """Drive through a town for 20 s and note the pose twice a second.
 
@@ -48,12 +55,18 @@ def drive(town: Town, seed: int) -> Trajectory:
 
     Returns:
         40 key frames, 0.5 s apart, with a small pitch and roll.
+
+    Raises:
+        NoDriveError: no street is long enough, or traffic stops the car too early.
     """
     random = np.random.default_rng([0x726F757465, seed])
     path, stops = _draw_path(random, town)
     if town.vector_map.left_hand:
         path = mirrored(path)
-    return drive_along_path(random, path, stops, float(random.uniform(7.0, 12.0)), seed)
+    driven = drive_along_path(random, path, stops, float(random.uniform(7.0, 12.0)), seed)
+    if arc_length(driven.ego_to_global[:, :2, 3])[-1] <= SHORTEST_DRIVE:
+        raise NoDriveError("the drive is too short")
+    return driven
 
 
 def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
@@ -63,7 +76,7 @@ def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
         The path ``(n, 2)`` at even steps, and the distances along it at which a car may have to stop.
 
     Raises:
-        RuntimeError: the town has no such walk.
+        NoDriveError: the town has no such walk.
     """
     road = town.surface.buffer(0.05)
     shapely.prepare(road)
@@ -80,7 +93,7 @@ def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
         if best is None or len(path) > len(best[0]):
             best = path, stops
     if best is None:
-        raise RuntimeError("the town has no street that is long enough for a drive")
+        raise NoDriveError("the town has no street that is long enough for a drive")
     return best
 
 

@@ -21,7 +21,7 @@ from predmapnet.demo_world.town.medians import painted_gaps
 from predmapnet.demo_world.town.mirror import mirrored_map
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.town.road_paint import paint_street
-from predmapnet.demo_world.town.street_plan import Rank, StreetPlan, plan_streets
+from predmapnet.demo_world.town.street_plan import Rank, Street, StreetPlan, plan_streets
 from predmapnet.demo_world.town.works import Stretch, Works, spaced
 from predmapnet.demo_world.world import LineStyle, VectorMap
 
@@ -66,10 +66,11 @@ def build_town(seed: int, attempt: int = 0) -> Town:
         stations = spaced(stretch.start, stretch.end)
         edges = section.edges(stations)
         works.paved.append(line.band(stations, edges[-1], edges[0]))
-    for stretch in stretches:
-        furnish(random, plan, sections[stretch.street], stretch, habits, works)
-    for index in range(len(plan.streets)):
-        _paint(random, plan, sections[index], index, [s for s in stretches if s.street == index], habits, works)
+    by_street = [[stretch for stretch in stretches if stretch.street == index] for index in range(len(plan.streets))]
+    for index, own in enumerate(by_street):
+        furnish(random, plan, sections[index], own, habits, works)
+    for index, own in enumerate(by_street):
+        _paint(random, plan.streets[index], sections[index], own, habits, works)
     vector_map, surface = assemble(plan, sections, stretches, habits, works)
     if habits.left_hand:
         vector_map = mirrored_map(vector_map)
@@ -132,16 +133,9 @@ def _stop_line(line: ReferenceLine, section: CrossSection, reach: ArmReach, work
 
 
 def _paint(
-    random: Generator,
-    plan: StreetPlan,
-    section: CrossSection,
-    index: int,
-    stretches: list[Stretch],
-    habits: Habits,
-    works: Works,
+    random: Generator, street: Street, section: CrossSection, stretches: list[Stretch], habits: Habits, works: Works
 ) -> None:
     """Paint one street; lines run on where only alleys join it."""
-    street = plan.streets[index]
     if street.rank is Rank.ALLEY:
         return
     runs: list[list[float]] = []
