@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import LineString, Polygon
 
-from predmapnet.datasets.ground_truth.map_file import read_map
+from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.demo_world.av2_dressing import vector_map_of
 from predmapnet.demo_world.catalogue import FIRST_SPLITS, vector_map
 from predmapnet.demo_world.first_towns import first_town
@@ -63,6 +64,24 @@ def free_map(path: Path) -> VectorMap:
         lane_paths=tuple(np.array(line) for line in content["lane_paths"]),
         markings=edges,
     )
+
+
+def argoverse_map(path: Path) -> VectorMap:
+    """A map of Argoverse 2, with the lanes of cars outside junctions and their centre lines."""
+    content = read_map_file(path)[0]
+    lanes, paths = [], []
+    for lane in content["lane_segments"].values():
+        sides = [
+            LineString([(place["x"], place["y"]) for place in lane[f"{side}_lane_boundary"]])
+            for side in ("left", "right")
+        ]
+        outline = Polygon([*sides[0].coords, *reversed(sides[1].coords)])
+        if lane["is_intersection"] or lane["lane_type"] == "BIKE" or not outline.is_valid:
+            continue
+        left, right = (shapely.line_interpolate_point(side, np.linspace(0, 1, 12), normalized=True) for side in sides)
+        lanes.append(outline)
+        paths.append((shapely.get_coordinates(left) + shapely.get_coordinates(right)) / 2)
+    return replace(vector_map_of(content), lanes=tuple(lanes), lane_paths=tuple(paths))
 
 
 def crossing_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
@@ -162,7 +181,7 @@ def lane_row(maps: list[VectorMap]) -> Row:
 
 
 def street_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
-    """Measures of streets, looked at across a lane every 20 m: lanes each way, medians; and lanes that open or close."""
+    """Measures of streets, looked at across a lane every 20 m: lanes each way, medians; lanes that open or close."""
     same, opposite, medians = [], [], []
     ends, length = 0, 0.0
     for town, road in zip(maps, roads, strict=True):
@@ -342,7 +361,7 @@ def sources(towns: int) -> Iterator[tuple[str, Callable[[], list[VectorMap]]]]:
     yield "old towns", lambda: [first_town(number)[0] for number in FIRST_SPLITS["test"]]
     archives = sorted((root / "ground_truth/av2/logs").glob("*/map/log_map_archive_*.json"))
     if archives:
-        yield "Argoverse 2", lambda: [vector_map_of(read_map(path)[0]) for path in archives]
+        yield "Argoverse 2", lambda: [argoverse_map(path) for path in archives]
     for folder, kinds in (("check", ("*",)), ("train", ("carla*", "cambridge*"))):
         for kind in kinds:
             files = sorted((root / "road_geometry" / folder).glob(f"{kind}.json"))

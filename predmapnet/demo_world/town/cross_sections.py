@@ -64,7 +64,7 @@ class Strip:
         width = np.full(len(stations), self.width)
         for at, added in self.changes:
             width += np.interp(stations, at, added)
-        return np.maximum(width, 0.0)
+        return np.asarray(np.maximum(width, 0.0))
 
 
 @dataclass
