@@ -44,8 +44,7 @@ def train(
 
     from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.training import run
-    from predmapnet.training.clip_settings import trains_in_clips
-    from predmapnet.training.settings import plan_run
+    from predmapnet.training.settings import plan_run, trains_in_clips
 
     run.check_data(data)
     config = run.configuration(preset)

@@ -18,21 +18,19 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
 from predmapnet.machine import NetworkOptions, Precision
-from predmapnet.network.image_input import Window, normalise_images, stack_windows
+from predmapnet.network.calibration import Calibration, calibrate
+from predmapnet.network.image_input import WindowPixels, normalise_images, stack_windows
 from predmapnet.network.kernels.compilation import compile_features
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.rig_geometry import arranged_rig
-from predmapnet.network.state import FrameInputs, Instances, RigGeometry, Selection, StreamState
+from predmapnet.network.state import FrameInputs, Instances, Selection, StreamState, ViewGeometry
 from predmapnet.network.track_selection import select
-from predmapnet.scenes import Frame, Image, Rig, ground_in_view
+from predmapnet.scenes import Frame, Image, ground_in_view
 from predmapnet.weights.checkpoint import load_checkpoint
 
-RIG_TOLERANCE = 1e-4
-"""Calibrations that differ by less (absolutely in metres, or relatively) share their look-up."""
-
-RIGS_KEPT = 8
+CALIBRATIONS_KEPT = 8
+"""Calibrations whose geometry is remembered; cameras that never move cost it once."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +38,11 @@ class CameraImages:
     """Images of one instant as the network wants them.
 
     Attributes:
-        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the network; black where there is no image.
+        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the rig; black where there is no image.
         valid: ``(N,) bool``.
     """
 
-    windows: Window
+    windows: WindowPixels
     valid: NDArray[np.bool_]
 
 
@@ -85,7 +83,7 @@ class Mapper:
         if compiled:
             compile_features(self.network)
         self._device = torch.device(device)
-        self._lookups: list[tuple[Rig, RigGeometry]] = []
+        self._geometries: dict[bytes, ViewGeometry] = {}
 
     @classmethod
     def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
@@ -117,8 +115,7 @@ class Mapper:
                 network has learned.
         """
         images: dict[str, Image] = {}
-        rig = arranged_rig(frame.rig, self.config)
-        for camera in rig:
+        for camera in frame.rig:
             path = frame.images.get(camera.name)
             if path is None or not path.exists():
                 if not allow_missing_cameras:
@@ -129,7 +126,7 @@ class Mapper:
             raise UserError(
                 f"Frame {frame.index} of {frame.scene} has no image of any camera: there is nothing to map."
             )
-        windows, valid = stack_windows(images, rig, self.config.image)
+        windows, valid = stack_windows(images, frame.rig, self.config.image)
         return CameraImages(windows, valid)
 
     @torch.inference_mode()
@@ -159,32 +156,34 @@ class Mapper:
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
-        rig = arranged_rig(frame.rig, self.config)
+        calibration = calibrate(frame.rig, self.config)
         inputs = FrameInputs(
             images=normalise_images(torch.from_numpy(images.windows)[None].to(self._device), self.config.image),
             camera_valid=torch.from_numpy(images.valid)[None].to(self._device),
             ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(self._device),
+            calibration=calibration.to(self._device),
         )
         if state is None:
             state = self.network.initial_state(1)
-        outputs = self.network(inputs, self._lookup(rig), state)
+        outputs = self.network(inputs, state, self._geometry(calibration))
         selection = select(outputs, state, self.config)
         state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
         frame_map = to_frame_map(
             selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
         )
-        working = (camera for camera, valid in zip(rig, images.valid, strict=True) if valid)
+        working = (camera for camera, valid in zip(frame.rig, images.valid, strict=True) if valid)
         return replace(frame_map, visible=ground_in_view(working, self.roi)), state
 
-    def _lookup(self, rig: Rig) -> RigGeometry:
-        """Return the look-up of a rig; the last few are kept."""
-        for position, (known, lookup) in enumerate(self._lookups):
-            if known is rig or _same_rig(known, rig):
-                self._lookups.insert(0, self._lookups.pop(position))
-                return lookup
-        lookup = self.network.make_rig_lookup(rig)
-        self._lookups = [(rig, lookup), *self._lookups[: RIGS_KEPT - 1]]
-        return lookup
+    def _geometry(self, calibration: Calibration) -> ViewGeometry:
+        """Return the geometry of a calibration, from the few that were used last."""
+        key = calibration.fingerprint()
+        geometry = self._geometries.pop(key, None)
+        if geometry is None:
+            geometry = self.network.view_geometry(calibration.to(self._device))
+        self._geometries[key] = geometry
+        if len(self._geometries) > CALIBRATIONS_KEPT:
+            del self._geometries[next(iter(self._geometries))]
+        return geometry
 
 
 def choose_device(name: str) -> torch.device:
@@ -202,19 +201,6 @@ def choose_device(name: str) -> torch.device:
         reason = str(error).splitlines()[0]
         raise UserError(f"The device '{name}' cannot be used ({reason}). Try --device cpu.") from None
     return device
-
-
-def _same_rig(first: Rig, second: Rig) -> bool:
-    def looks(rig: Rig) -> list[tuple[str, int, int, float]]:
-        return [(camera.name, camera.width, camera.height, camera.ground_height) for camera in rig]
-
-    def numbers(rig: Rig) -> Float:
-        return np.concatenate([part.ravel() for camera in rig for part in (camera.intrinsics, camera.camera_to_ego)])
-
-    if looks(first) != looks(second):
-        return False
-    one, other = numbers(first), numbers(second)
-    return bool((np.abs(one - other) <= RIG_TOLERANCE * (1 + np.abs(other))).all())
 
 
 def _missing_camera(frame: Frame, camera: str, path: Path | None) -> str:

@@ -13,6 +13,7 @@ from predmapnet.config import (
     EncoderBevMemoryConfig,
     FutureConfig,
     HistoryMapConfig,
+    LookupBevConfig,
     MapTrackerDecoderConfig,
     MaskConfig,
     PredMapNetConfig,
@@ -65,7 +66,7 @@ def _paper(name: str, baseline: PredMapNetConfig) -> PredMapNetConfig:
     changes = {
         "name": name,
         "semantic_queries": SemanticQueriesConfig(layers=3),
-        "history_map": HistoryMapConfig(),
+        "history_map": HistoryMapConfig(masks="generated"),
         "future": FutureConfig(hidden=512),
         "tracking": baseline.tracking.model_copy(update={"tau_d": 0.4, "first_tau_d": None}),
         "depth": DepthConfig(enabled=True, bins=68, far=35.0),
@@ -78,7 +79,9 @@ _ARGOVERSE2 = _maptracker("maptracker-av2", WholeImageConfig(width=608, height=6
 PRESETS = {
     config.name: config
     for config in (
-        PredMapNetConfig(name="lite", future=FutureConfig(steady_motion=True)),
+        PredMapNetConfig(
+            name="lite", bev=LookupBevConfig(further_heights=(-0.5, 0.5)), future=FutureConfig(steady_motion=True)
+        ),
         _paper("paper-nuscenes", _NUSCENES),
         _paper("paper-av2", _ARGOVERSE2),
         _NUSCENES,

@@ -8,10 +8,8 @@ from torch import Tensor, nn
 from mapfusion.elements import ElementKind
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.ego_motion import move_points
-from predmapnet.network.layers import Perceptron, sine_code, zero_init
+from predmapnet.network.layers import SINE_FREQUENCIES, Perceptron, sine_code, zero_init
 from predmapnet.network.polylines import clip_polylines
-
-FREQUENCIES = 6
 
 
 class ShortTermFutureGuidance(nn.Module):
@@ -29,7 +27,7 @@ class ShortTermFutureGuidance(nn.Module):
         self.steady_motion = config.future.steady_motion
         self.roi = config.roi
         self.offsets = Perceptron(histories * (2 * points + 1), hidden, hidden, 2 * points, zero_last=True)
-        self.point_embedding = Perceptron(4 * FREQUENCIES, width, width)
+        self.point_embedding = Perceptron(4 * SINE_FREQUENCIES, width, width)
         self.fusion = nn.Linear(2 * width, width)
         zero_init(self.fusion)
 
@@ -69,7 +67,7 @@ class ShortTermFutureGuidance(nn.Module):
             queries: ``(B, T, C)``.
             forecasts: ``(B, T, P, 2)``, normalised.
         """
-        future = self.point_embedding(sine_code(forecasts, FREQUENCIES)).mean(dim=2)
+        future = self.point_embedding(sine_code(forecasts, SINE_FREQUENCIES)).mean(dim=2)
         return queries + self.fusion(torch.cat([queries, future], dim=-1))
 
 

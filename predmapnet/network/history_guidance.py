@@ -6,9 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.layers import Attention, cell_centres, flatten_cells, sine_code, zero_init
-
-FREQUENCIES = 6
+from predmapnet.network.layers import SINE_FREQUENCIES, Attention, cell_centres, flatten_cells, sine_code, zero_init
 
 
 class HistoryMapGuidance(nn.Module):
@@ -23,7 +21,7 @@ class HistoryMapGuidance(nn.Module):
         self.threshold = config.history_map.threshold
         bev_width = config.bev.widths[1] if config.masks.stride == 2 else config.bev.widths[0]
         self.input = nn.Linear(bev_width, width)
-        self.cell_code = nn.Linear(4 * FREQUENCIES, width)
+        self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, width)
         self.class_code = nn.Embedding(config.decoder.classes, width)
         self.cross_attention = Attention(width, config.decoder.heads)
         zero_init(self.cross_attention.output)
@@ -43,7 +41,7 @@ class HistoryMapGuidance(nn.Module):
         if queries.shape[1] == 0:
             return queries
         rows, columns = bev.shape[-2:]
-        code = self.cell_code(sine_code(cell_centres(rows, columns, bev.device), FREQUENCIES).flatten(0, 1))
+        code = self.cell_code(sine_code(cell_centres(rows, columns, bev.device), SINE_FREQUENCIES).flatten(0, 1))
         sampled = self.input(flatten_cells(bev)) + code
         valid = history_maps.detach().flatten(2) > self.threshold
         some = valid.any(dim=-1, keepdim=True)

@@ -1,4 +1,4 @@
-"""From stored photographs to the network's input: scaling, the part that is seen, and normalisation.
+"""Image input: scaling, the part that the network sees, and normalisation.
 
 The mapper and the training use these same functions, so that both see the same pixels. What happens is decided by the
 kind of the configuration: the window below the sky, or the whole image as MapTracker takes it.
@@ -22,7 +22,7 @@ from mapfusion.geometry import inverse_pose
 from predmapnet.config import ImageConfig, ImageWindowConfig, WholeImageConfig
 from predmapnet.scenes import Camera, Image, Rig
 
-Window = NDArray[np.uint8] | NDArray[np.float32]
+WindowPixels = NDArray[np.uint8] | NDArray[np.float32]
 """Pixels 0 to 255. Windows are rounded; whole images are not, since MapTracker stretches floating-point images."""
 
 
@@ -89,7 +89,7 @@ def input_size(config: ImageConfig) -> tuple[int, int]:
     return config.height, config.width
 
 
-def crop_image(image: Image, camera: Camera, config: ImageConfig) -> Window:
+def crop_image(image: Image, camera: Camera, config: ImageConfig) -> WindowPixels:
     """Scale one stored image and cut out what the network sees.
 
     Args:
@@ -148,7 +148,7 @@ def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
     return ((images.float() - mean * 255.0) / deviation).movedim(-1, -3)
 
 
-def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[Window, NDArray[np.bool_]]:
+def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) -> tuple[WindowPixels, NDArray[np.bool_]]:
     """Cut the windows of one instant.
 
     Args:
@@ -167,7 +167,7 @@ def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) ->
 def mirror_rig(rig: Rig) -> Rig:
     """Return the rig that sees the world mirrored at the x axis through horizontally flipped images.
 
-    Training may flip images and negate y of the truth, for any rig, if it builds the look-up of this one.
+    Training flips images and negates y of the truth, and hands the network the calibration of this rig.
     """
     mirror = np.diag([1.0, -1.0, 1.0])
     flip = np.diag([-1.0, 1.0, 1.0])
@@ -180,25 +180,3 @@ def mirror_rig(rig: Rig) -> Rig:
         intrinsics[0, 2] = camera.width - intrinsics[0, 2]
         cameras.append(replace(camera, intrinsics=intrinsics, camera_to_ego=pose))
     return tuple(cameras)
-
-
-def mirror_order(rig: Rig, tolerance: float = 1e-3) -> tuple[int, ...] | None:
-    """For a mirror-symmetric rig, tell which camera takes whose place under :func:`mirror_rig`.
-
-    ``images[:, order].flip(-1)`` with y of the truth negated is then an exact new sample of the same rig.
-
-    Returns:
-        One index per camera, or None if the rig is not symmetric within ``tolerance`` (metres, and relative pixels).
-    """
-
-    def same(first: Camera, second: Camera) -> bool:
-        size_equal = (first.width, first.height) == (second.width, second.height)
-        return (
-            size_equal
-            and np.allclose(first.camera_to_ego, second.camera_to_ego, atol=tolerance)
-            and np.allclose(first.intrinsics, second.intrinsics, atol=tolerance * first.width)
-        )
-
-    mirrored = mirror_rig(rig)
-    order = [next((i for i, other in enumerate(mirrored) if same(camera, other)), -1) for camera in rig]
-    return None if -1 in order else tuple(order)

@@ -143,6 +143,10 @@ def zero_init(layer: nn.Module) -> None:
         nn.init.zeros_(layer.bias)
 
 
+SINE_FREQUENCIES = 6
+"""Octaves of :func:`sine_code` for positions in the region: periods from twice its length down to 1/16 of it."""
+
+
 def sine_code(positions: Tensor, frequencies: int) -> Tensor:
     """Encode coordinates in [0, 1] by sines and cosines of octaves from half a period up.
 

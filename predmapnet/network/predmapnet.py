@@ -1,4 +1,4 @@
-"""PredMapNet, whole: reads like Fig. 2 of the paper."""
+"""PredMapNet, the whole network: reads like Fig. 2 of the paper."""
 
 from __future__ import annotations
 
@@ -14,26 +14,28 @@ from predmapnet.config import (
     ResNet50Config,
 )
 from predmapnet.network.bev_pyramid import BevPyramid
-from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
+from predmapnet.network.former_tracks import find_former_tracks, match_tracks
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
 from predmapnet.network.history_guidance import HistoryMapGuidance
 from predmapnet.network.history_memory import HistoryRasterMapMemory
+from predmapnet.network.image_input import input_size
 from predmapnet.network.instance_masks import MaskHead
-from predmapnet.network.maptracker.bev_memory import keep_map
+from predmapnet.network.map_decoder import DecoderInput, MapDecoder
+from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.bevformer import BevFormer
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.maptracker.resnet import ResNet50Pyramid
-from predmapnet.network.maptracker.vector_memory import empty_vector_memory, remember
-from predmapnet.network.revival import recall, still_lost
-from predmapnet.network.rig_geometry import make_rig_geometry
+from predmapnet.network.maptracker.vector_memory import empty_vector_memory, store_queries
+from predmapnet.network.revival import still_lost, with_returned_tracks
 from predmapnet.network.segmentation_head import SegmentationHead, UpsamplingSegmentationHead
 from predmapnet.network.semantic_queries import GeneratedQueries, SemanticAwareQueryGenerator
 from predmapnet.network.small.backbone import ImageBackbone
 from predmapnet.network.small.bev_encoder import BevEncoder
-from predmapnet.network.small.bev_memory import TemporalBevFusion, empty_memory, remember_bev
-from predmapnet.network.small.decoder import MapDecoder
+from predmapnet.network.small.decoder import PointDecoder
+from predmapnet.network.small.residual_bev_memory import ResidualBevMemory, empty_bev_memory, store_raw_map
 from predmapnet.network.state import (
     BevFeatures,
     FrameInputs,
@@ -42,13 +44,11 @@ from predmapnet.network.state import (
     Instances,
     LayerPredictions,
     LostTracks,
-    RigGeometry,
     StreamState,
     VectorMemory,
+    ViewGeometry,
 )
-from predmapnet.network.track_memory import match_tracks, memory_of_tracks
 from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
-from predmapnet.scenes import Rig
 
 
 class PredMapNet(nn.Module):
@@ -60,7 +60,7 @@ class PredMapNet(nn.Module):
 
     One step of a stream::
 
-        outputs = net(inputs, lookup, state)
+        outputs = net(inputs, state)
         selection = select(outputs, state, net.config)
         state = net.advance(state, outputs, selection.instances, inputs, selection.lost)
     """
@@ -74,11 +74,7 @@ class PredMapNet(nn.Module):
             if isinstance(config.backbone, ResNet50Config)
             else ImageBackbone(config.backbone)
         )
-        self.bev_encoder = (
-            BevFormer(config)
-            if isinstance(config.bev, BevFormerConfig)
-            else BevEncoder(config.backbone.channels, config.bev)
-        )
+        self.bev_encoder = BevFormer(config) if isinstance(config.bev, BevFormerConfig) else BevEncoder(config)
         self.segmentation_head = (
             UpsamplingSegmentationHead(fine, classes)
             if config.segmentation.kind == "upsampling"
@@ -86,7 +82,7 @@ class PredMapNet(nn.Module):
         )
         self.query_generator = SemanticAwareQueryGenerator(config)
         maptracker = isinstance(config.decoder, MapTrackerDecoderConfig)
-        self.map_decoder: RowDecoder = MapTrackerDecoder(config) if maptracker else MapDecoder(config)
+        self.map_decoder: MapDecoder = MapTrackerDecoder(config) if maptracker else PointDecoder(config)
         self.propagation = PoseTrackPropagation(config) if maptracker else TrackPropagation(config)
         needs_masks = config.semantic_queries.enabled or config.history_map.memory
         self.mask_head = MaskHead(config) if needs_masks else None
@@ -95,7 +91,7 @@ class PredMapNet(nn.Module):
         self.future_guidance = ShortTermFutureGuidance(config) if config.future.enabled else None
         memory = config.temporal_bev
         residual = isinstance(memory, ResidualBevMemoryConfig) and memory.enabled
-        self.temporal_bev = TemporalBevFusion(config) if residual else None
+        self.temporal_bev = ResidualBevMemory(config) if residual else None
         needs_pyramid = isinstance(config.bev, BevFormerConfig) and config.semantic_queries.enabled
         self.bev_pyramid = BevPyramid(config.bev.widths) if needs_pyramid else None
         self.depth_head = DepthHead(config.backbone.channels, config.depth) if config.depth.enabled else None
@@ -106,16 +102,22 @@ class PredMapNet(nn.Module):
         """Where the parameters are."""
         return self.query_generator.content.device
 
-    def make_rig_lookup(self, rig: Rig) -> RigGeometry:
-        """Precompute where a rig sees the ground (cameras at the size of their stored images)."""
-        return make_rig_geometry(rig, self.config).to(self.device)
+    def view_geometry(self, calibration: Calibration, size: tuple[int, int] | None = None) -> ViewGeometry:
+        """Find where the cameras of some frames see the ground; the result serves as long as no camera moves.
+
+        Args:
+            calibration: of the frames.
+            size: rows and columns of the network's input, if not those of the configuration.
+        """
+        geometry: ViewGeometry = self.bev_encoder.geometry(calibration, size or input_size(self.config.image))
+        return geometry
 
     def initial_state(self, batch: int) -> StreamState:
         """Return the state before the first frame of ``batch`` streams: no tracks, nothing remembered."""
         config, device = self.config, self.device
         points, histories = config.decoder.points, config.future.histories
         floats, integers = torch.zeros(batch, 0, device=device), torch.zeros(batch, 0, dtype=torch.int64, device=device)
-        maps, poses, valid = empty_memory(batch, config, device)
+        maps, poses, valid = empty_bev_memory(batch, config, device)
         masks = torch.zeros(batch, 0, *(config.mask_size if self.mask_head is not None else (0, 0)), device=device)
         polylines = torch.zeros(batch, 0, points, 2, device=device)
         instances = Instances(
@@ -143,41 +145,58 @@ class PredMapNet(nn.Module):
             vector_memory=empty_vector_memory(batch, config, device),
         )
 
-    def forward(self, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None) -> FrameOutputs:
+    def forward(
+        self, inputs: FrameInputs, state: StreamState | None = None, geometry: ViewGeometry | None = None
+    ) -> FrameOutputs:
         """Map one instant of ``B`` streams.
 
         Args:
-            inputs: images, which cameras count, and poses.
-            lookup: of the rig that took the images.
+            inputs: images, cameras and poses.
             state: of the last frame; None or an empty state makes it a single-frame network.
+            geometry: :meth:`view_geometry` of these cameras, if it is known; found here otherwise.
         """
-        return self.decode_bev(self.encode_bev(self.encode_images(inputs), inputs, lookup, state), inputs, state)
+        bev = self.encode_bev(self.encode_images(inputs), inputs, state, geometry)
+        return self.decode_bev(bev, inputs, state)
 
     def encode_images(self, inputs: FrameInputs) -> ImageFeatures:
         """From images to image features: no memory and no geometry yet."""
-        batch = len(inputs.images)
-        # What a masked camera saw must not reach anything: not batch statistics, not even as not-a-number.
-        images = inputs.images.masked_fill(~inputs.camera_valid[:, :, None, None, None], 0.0)
-        levels = self.image_backbone(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-        depth = None
-        if self.depth_head is not None and self.training:
-            depth = self.depth_head(levels[0]).unflatten(0, (batch, -1))
-        return ImageFeatures([level.unflatten(0, (batch, -1)) for level in levels], depth)
+        valid = inputs.camera_valid
+        # What a masked camera saw must not reach anything, not even as not-a-number.
+        images = inputs.images.masked_fill(~valid[:, :, None, None, None], 0.0).flatten(0, 1)
+        seen = valid.flatten().nonzero()[:, 0] if self.training else None
+        if seen is not None and 0 < len(seen) < len(images):  # Black images would enter the batch statistics.
+            images = images[seen]
+        else:
+            seen = None
+        levels = self.image_backbone(images.contiguous(memory_format=torch.channels_last))
+        depth = self.depth_head(levels[0]) if self.depth_head is not None and self.training else None
+
+        def of_cameras(features: Tensor) -> Tensor:
+            return (features if seen is None else _spread(features, seen, valid.numel())).unflatten(0, valid.shape)
+
+        return ImageFeatures([of_cameras(level) for level in levels], None if depth is None else of_cameras(depth))
 
     def encode_bev(
-        self, images: ImageFeatures, inputs: FrameInputs, lookup: RigGeometry, state: StreamState | None = None
+        self,
+        images: ImageFeatures,
+        inputs: FrameInputs,
+        state: StreamState | None = None,
+        geometry: ViewGeometry | None = None,
     ) -> BevFeatures:
         """From image features to BEV features; with the encoder ``bevformer`` the BEV memory takes part.
 
         Args:
             images: of :meth:`encode_images`.
-            inputs: which cameras count, and poses.
-            lookup: of the rig that took the images.
+            inputs: cameras and poses.
             state: of the last frame.
+            geometry: :meth:`view_geometry` of these cameras, if it is known.
         """
         if state is None:
             state = self.initial_state(len(inputs.camera_valid))
-        levels = self.bev_encoder(images.levels, inputs, lookup, state)
+        if geometry is None:
+            rows, columns = inputs.images.shape[-2:]
+            geometry = self.view_geometry(inputs.calibration, (rows, columns))
+        levels = self.bev_encoder(images.levels, inputs, geometry, state)
         if self.bev_pyramid is not None:
             levels = self.bev_pyramid(levels[0])
         return BevFeatures(levels, images.depth)
@@ -190,7 +209,7 @@ class PredMapNet(nn.Module):
         mask_features = None if self.mask_head is None else self.mask_head.mask_features(levels)
         detections = self.query_generator(levels[::-1], mask_features, self.mask_head)
         tracks, history = self._track_rows(state, inputs.ego_to_global, levels)
-        start = DecoderRows(
+        start = DecoderInput(
             queries=torch.cat([tracks.queries, detections.queries], dim=1),
             points=torch.cat([tracks.points, detections.points], dim=1),
             track_valid=tracks.valid,
@@ -202,13 +221,14 @@ class PredMapNet(nn.Module):
         layers = self._generator_layers(detections, tracks, mask_features)
         layers += [LayerPredictions(logits, points, None) for logits, points in refined]
         if self.mask_head is not None and mask_features is not None:
-            layers[-1].masks = self.mask_head(embedding, mask_features)
+            decoded = self.config.history_map.masks == "decoded"
+            layers[-1].masks = self.mask_head(embedding if decoded else start.queries, mask_features)
         no_id = state.instances.track_ids.new_full(detections.queries.shape[:2], -1)
         return FrameOutputs(
             layers=layers,
             queries=embedding,
-            row_valid=start.valid,
-            row_track_ids=torch.cat([state.instances.track_ids, no_id], dim=1),
+            query_valid=start.valid,
+            query_track_ids=torch.cat([state.instances.track_ids, no_id], dim=1),
             segmentation=self.segmentation_head(levels[0]),
             bev=remembered,
             ego_to_global=inputs.ego_to_global,
@@ -249,16 +269,18 @@ class PredMapNet(nn.Module):
     ) -> list[LayerPredictions]:
         """Predictions of the query generator; track rows say the same in all of them, the decoder's input."""
         points = None if self.map_decoder.learns_start else torch.cat([tracks.points, detections.points], dim=1)
-        if not detections.logits:
+        if not detections.masks:
             return [] if points is None else [LayerPredictions(None, points, None)]
         assert mask_features is not None and self.mask_head is not None
-        track_logits = self.query_generator.classify(tracks.queries)
         track_masks = self.mask_head(tracks.queries, mask_features)
-        layers = [
-            LayerPredictions(torch.cat([track_logits, logits], dim=1), None, torch.cat([track_masks, masks], dim=1))
-            for logits, masks in zip(detections.logits, detections.masks, strict=True)
-        ]
+        layers = [LayerPredictions(None, None, torch.cat([track_masks, masks], dim=1)) for masks in detections.masks]
+        if self.query_generator.classify is not None:
+            track_logits = self.query_generator.classify(tracks.queries)
+            for layer, logits in zip(layers, detections.logits, strict=True):
+                layer.logits = torch.cat([track_logits, logits], dim=1)
         layers[-1].points = points
+        if self.config.history_map.masks == "generated":
+            layers[-1].masks = None  # They are those of the result, and are not said twice.
         return layers
 
     def advance(
@@ -283,9 +305,9 @@ class PredMapNet(nn.Module):
         if state is None:
             state = self.initial_state(len(inputs.ego_to_global))
         warped = outputs.warped_history if self.config.history_map.memory else None
-        memory = memory_of_tracks(instances, state, warped)
+        memory = find_former_tracks(instances, state, warped)
         if lost is not None:
-            memory = recall(memory, instances, lost, inputs.ego_to_global, self.config.roi)
+            memory = with_returned_tracks(memory, instances, lost, inputs.ego_to_global, self.config.roi)
         history_maps = instances.masks
         if memory.history_maps is not None:
             history_maps = self.history_memory.update(
@@ -319,8 +341,8 @@ class PredMapNet(nn.Module):
     def _remembered_maps(self, state: StreamState, bev: Tensor, ego_to_global: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         memory = self.config.temporal_bev
         if isinstance(memory, EncoderBevMemoryConfig):
-            return keep_map(state, bev, ego_to_global, memory)
-        return remember_bev(state, bev, ego_to_global, memory.spacing)
+            return store_bev_map(state, bev, ego_to_global, memory)
+        return store_raw_map(state, bev, ego_to_global, memory.spacing)
 
     def _remembered_queries(self, state: StreamState, instances: Instances, ego_to_global: Tensor) -> VectorMemory:
         """Store the queries; tracks that came back begin anew, as their query does."""
@@ -328,7 +350,13 @@ class PredMapNet(nn.Module):
         if memory.valid.shape[2] == 0:
             return memory
         source, matched = match_tracks(instances, state.instances)
-        return remember(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
+        return store_queries(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
+
+
+def _spread(features: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Put features ``(M, C, h, w)`` into these rows of ``(count, C, h, w)``, channels-last; the others are zero."""
+    pixels = features.permute(0, 2, 3, 1)
+    return pixels.new_zeros(count, *pixels.shape[1:]).index_copy(0, rows, pixels).permute(0, 3, 1, 2)
 
 
 def last_motion(state: StreamState, ego_to_global: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Lost tracks that come back, which the paper lists among what it lacks.
+"""Revival of lost tracks, which the paper lists among what it lacks.
 
 A track is lost from its first frame without support on, be it that its score is low or that it left the ROI. Whether
 it still lives on unsupported or has ended makes no difference: an unsupported polyline soon strays from its line. A
@@ -17,10 +17,10 @@ from torch import Tensor
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PredMapNetConfig, RevivalConfig
 from predmapnet.network.ego_motion import move_points, relative_motion, warp_bev
+from predmapnet.network.former_tracks import FormerTracks, match_tracks
 from predmapnet.network.state import Instances, LostTracks, StreamState
-from predmapnet.network.track_memory import TrackMemory, match_tracks
 
-ROUNDS = 3
+CONTESTS = 3
 """Contests for lost tracks that are settled; who loses one may win another."""
 
 LEAST_POINTS = 3
@@ -65,9 +65,9 @@ def revive(
     return replace(instances, valid=instances.valid & ~replaced, track_ids=ids), lost
 
 
-def recall(
-    memory: TrackMemory, instances: Instances, lost: LostTracks, ego_to_global: Tensor, roi: RegionOfInterest
-) -> TrackMemory:
+def with_returned_tracks(
+    memory: FormerTracks, instances: Instances, lost: LostTracks, ego_to_global: Tensor, roi: RegionOfInterest
+) -> FormerTracks:
     """Add what is remembered of the lost tracks that came back, carried to this frame by the motion of the car.
 
     Args:
@@ -91,7 +91,7 @@ def recall(
         maps = torch.cat([maps, warped], dim=1)
     history, valid = _carried_history(lost, row, roi)
     former = memory.point_history.shape[1]
-    return TrackMemory(
+    return FormerTracks(
         source=torch.where(revived, former + torch.arange(row.shape[1], device=row.device), memory.source),
         matched=memory.matched | revived,
         history_maps=maps,
@@ -214,7 +214,7 @@ def _closest_pairs(distances: Tensor) -> Tensor:
     row = torch.arange(rows, device=distances.device)[:, None]
     column = torch.arange(columns, device=distances.device)
     pairs = torch.zeros_like(distances, dtype=torch.bool)
-    for _ in range(ROUNDS):
+    for _ in range(CONTESTS):
         nearest = (distances.argmin(dim=2, keepdim=True) == column) & (distances.argmin(dim=1, keepdim=True) == row)
         nearest = nearest & distances.isfinite()
         pairs = pairs | nearest

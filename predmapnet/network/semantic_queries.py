@@ -9,9 +9,15 @@ from torch import Tensor, nn
 
 from predmapnet.config import PointDecoderConfig, PredMapNetConfig
 from predmapnet.network.instance_masks import MaskHead, attention_cells
-from predmapnet.network.layers import Attention, FeedForward, Perceptron, cell_centres, flatten_cells, sine_code
-
-FREQUENCIES = 6
+from predmapnet.network.layers import (
+    SINE_FREQUENCIES,
+    Attention,
+    FeedForward,
+    Perceptron,
+    cell_centres,
+    flatten_cells,
+    sine_code,
+)
 
 
 @dataclass
@@ -21,8 +27,8 @@ class GeneratedQueries:
     Attributes:
         queries: ``(B, Q, C)``, Q^SA of layer L.
         points: ``(B, Q, P, 2)``, first guess of the polylines, normalised.
-        logits: ``(B, Q, 3)`` before the first and after each layer.
-        masks: ``(B, Q, H_m, W_m)`` logits, likewise.
+        logits: ``(B, Q, 3)`` before the first and after each layer; none of a generator that names no classes.
+        masks: ``(B, Q, H_m, W_m)`` logits before the first and after each layer.
     """
 
     queries: Tensor
@@ -62,7 +68,9 @@ class MaskedAttentionLayer(nn.Module):
 class SemanticAwareQueryGenerator(nn.Module):
     """Learned queries, refined by L layers of masked attention over the BEV levels, coarse to fine, round robin.
 
-    Switched off, the learned queries go to the decoder as they are (the random initialisation of the baselines).
+    Its masks know no classes. Only the lighter decoder, whose training assigns the truth to each layer of the generator
+    anew, needs their names for that. Switched off, the learned queries go to the decoder as they are (the random
+    initialisation of the baselines).
     """
 
     def __init__(self, config: PredMapNetConfig) -> None:
@@ -80,9 +88,10 @@ class SemanticAwareQueryGenerator(nn.Module):
         count = config.semantic_queries.layers
         self.layers = nn.ModuleList(MaskedAttentionLayer(decoder.width, decoder.heads) for _ in range(count))
         self.level_inputs = nn.ModuleList(nn.Linear(width, decoder.width) for width in config.bev.widths[::-1][:count])
-        self.cell_code = nn.Linear(4 * FREQUENCIES, decoder.width)
-        self.classify = nn.Linear(decoder.width, decoder.classes)
-        nn.init.constant_(self.classify.bias, -3.0)
+        self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, decoder.width)
+        self.classify = nn.Linear(decoder.width, decoder.classes) if isinstance(decoder, PointDecoderConfig) else None
+        if self.classify is not None:
+            nn.init.constant_(self.classify.bias, -3.0)
 
     def forward(
         self, levels: list[Tensor], mask_features: Tensor | None, mask_head: MaskHead | None
@@ -99,15 +108,20 @@ class SemanticAwareQueryGenerator(nn.Module):
         masks: list[Tensor] = []
         if self.enabled:
             assert mask_features is not None and mask_head is not None
-            logits, masks = [self.classify(queries)], [mask_head(queries, mask_features)]
+            logits, masks = self._names(queries), [mask_head(queries, mask_features)]
             inputs = [linear(flatten_cells(level)) for linear, level in zip(self.level_inputs, levels, strict=False)]
             for number, layer in enumerate(self.layers):
                 turn = number % len(inputs)
                 rows, columns = levels[turn].shape[-2:]
-                code = self.cell_code(sine_code(cell_centres(rows, columns, queries.device), FREQUENCIES).flatten(0, 1))
+                code = self.cell_code(
+                    sine_code(cell_centres(rows, columns, queries.device), SINE_FREQUENCIES).flatten(0, 1)
+                )
                 allowed = attention_cells(masks[-1].detach(), (rows, columns), self.threshold)
                 queries = layer(queries, self.position, inputs[turn], code, allowed)
-                logits.append(self.classify(queries))
+                logits += self._names(queries)
                 masks.append(mask_head(queries, mask_features))
         points = self.first_guess(queries).sigmoid().unflatten(-1, (self.points, 2))
         return GeneratedQueries(queries, points, logits, masks)
+
+    def _names(self, queries: Tensor) -> list[Tensor]:
+        return [] if self.classify is None else [self.classify(queries)]

@@ -1,4 +1,4 @@
-"""What goes into the network, what comes out, and the state that is handed from frame to frame.
+"""Inputs and outputs of the network, and the state that is handed from frame to frame.
 
 ``B`` streams (logs) are processed side by side, ``T`` is the number of track rows (padded over the streams),
 ``Q`` of detection queries, ``P`` of points per polyline, ``C`` the width of the decoder, ``H x W`` the BEV grid
@@ -14,26 +14,29 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from predmapnet.network.maptracker.camera_pillars import CameraPillars
-from predmapnet.network.small.ground_lookup import RigLookup
+from predmapnet.network.calibration import Calibration
+from predmapnet.network.maptracker.reference_points import ReferencePoints
+from predmapnet.network.small.ground_lookup import GroundLookup
 
-RigGeometry = RigLookup | CameraPillars
-"""What is computed once per camera rig: a look-up for the BEV encoder ``lookup``, pillars for ``bevformer``."""
+ViewGeometry = GroundLookup | ReferencePoints
+"""Where the cameras of some frames see the ground, as the BEV encoder takes it; may be kept while they stay put."""
 
 
 @dataclass
 class FrameInputs:
-    """One instant of ``B`` streams that share a camera rig.
+    """One instant of ``B`` streams, of any cars; ``N`` is the largest number of cameras.
 
     Attributes:
         images: ``(B, N, 3, h, w) float32``, as :func:`predmapnet.network.image_input.normalise_images` makes them.
-        camera_valid: ``(B, N) bool``; False masks a missing or late camera out.
+        camera_valid: ``(B, N) bool``; False for a missing or late camera, and in padding.
         ego_to_global: ``(B, 4, 4) float64``.
+        calibration: of the cameras.
     """
 
     images: Tensor
     camera_valid: Tensor
     ego_to_global: Tensor
+    calibration: Calibration
 
 
 @dataclass
@@ -189,8 +192,8 @@ class FrameOutputs:
     Attributes:
         layers: all supervised layers, first to last; the last one is the result.
         queries: ``(B, T + Q, C)``, embedding of the last layer.
-        row_valid: ``(B, T + Q) bool``; False for padded track rows.
-        row_track_ids: ``(B, T + Q) int64``; -1 for detections.
+        query_valid: ``(B, T + Q) bool``; False for padded track rows.
+        query_track_ids: ``(B, T + Q) int64``; -1 for detections.
         segmentation: ``(B, 3, H_s, W_s)`` logits.
         bev: ``(B, C_bev, H, W)``, BEV features that go into the memory.
         ego_to_global: ``(B, 4, 4) float64``, pose of the instant.
@@ -200,8 +203,8 @@ class FrameOutputs:
 
     layers: list[LayerPredictions]
     queries: Tensor
-    row_valid: Tensor
-    row_track_ids: Tensor
+    query_valid: Tensor
+    query_track_ids: Tensor
     segmentation: Tensor
     bev: Tensor
     ego_to_global: Tensor

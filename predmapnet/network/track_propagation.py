@@ -1,4 +1,4 @@
-"""From the tracks of the last frame to the track rows of this one."""
+"""Query propagation: tracks of the last frame become track queries of this one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from predmapnet.network.ego_motion import move_points, plane_motion, relative_mo
 from predmapnet.network.layers import Perceptron
 from predmapnet.network.maptracker.bev_memory import nearest_pose
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
-from predmapnet.network.maptracker.vector_memory import Recalled, recall
+from predmapnet.network.maptracker.vector_memory import RecalledQueries, recall_queries
 from predmapnet.network.polylines import clip_polylines
 from predmapnet.network.state import StreamState
 
@@ -32,7 +32,7 @@ class CarriedTracks:
     queries: Tensor
     points: Tensor
     valid: Tensor
-    memory: Recalled | None = None
+    memory: RecalledQueries | None = None
 
 
 class TrackPropagation(nn.Module):
@@ -89,7 +89,7 @@ class PoseTrackPropagation(nn.Module):
         """
         decoder, tracks = self.config.decoder, state.instances
         assert isinstance(decoder, MapTrackerDecoderConfig)
-        memory = recall(state.vector_memory, self.motion, ego_to_global, state.frame, decoder.memory_distances)
+        memory = recall_queries(state.vector_memory, self.motion, ego_to_global, state.frame, decoder.memory_distances)
         past = state.ego_to_global
         if self.config.quirks.tracks_moved_from_chosen_history and not self.training:
             # Released weights are run with this pose, wrong or not; in training it is that of the last frame.

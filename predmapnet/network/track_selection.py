@@ -1,4 +1,4 @@
-"""Which rows of a frame live on as tracks: thresholds, merging of duplicates, identities."""
+"""Track selection: thresholds, merging of duplicates, and identities decide which queries live on."""
 
 from __future__ import annotations
 
@@ -120,10 +120,10 @@ def _candidates(outputs: FrameOutputs, state: StreamState | None, rules: Trackin
     enough = ranked[:, :count] > rules.report_threshold
     return _Rows(
         rows=rows,
-        valid=torch.cat([outputs.row_valid[:, :tracks], enough], dim=1),
+        valid=torch.cat([outputs.query_valid[:, :tracks], enough], dim=1),
         scores=scores.gather(1, rows),
         labels=labels.gather(1, rows),
-        track_ids=outputs.row_track_ids[:, :tracks],
+        track_ids=outputs.query_track_ids[:, :tracks],
         misses=rows[:, :0] if state is None else state.instances.misses,
     )
 

@@ -15,22 +15,20 @@ from torch.nn import functional
 
 from predmapnet.config import EncoderBevMemoryConfig
 from predmapnet.errors import UserError
-from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.maptracker.bev_memory import keep_map
+from predmapnet.network.ego_motion import relative_motion, relative_pose
+from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, RigGeometry, StreamState
+from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, StreamState
 from predmapnet.network.track_propagation import PoseTrackPropagation
 from predmapnet.network.track_selection import instances_from_rows
-from predmapnet.training.clip_settings import ClipSettings, ClipStage
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss
 from predmapnet.training.data.targets import Targets
-from predmapnet.training.losses.lite import focal_loss, forecast_loss, mask_loss, masks_of_size
+from predmapnet.training.losses.lite import forecast_loss, mask_loss, masks_of_size
 from predmapnet.training.losses.maptracker import (
-    CLASS_WEIGHT,
     LayerTargets,
     all_orders,
-    assign,
+    assign_layer,
     layer_losses,
     segmentation_losses,
     stacked,
@@ -38,7 +36,8 @@ from predmapnet.training.losses.maptracker import (
 )
 from predmapnet.training.losses.matching import Assignment
 from predmapnet.training.pose_noise import with_pose_noise
-from predmapnet.training.tracks import Owners, owned_truth
+from predmapnet.training.settings import ClipSettings, ClipStage
+from predmapnet.training.track_truth import TrackTruth, truth_of_tracks
 
 
 @dataclass
@@ -62,20 +61,19 @@ class Past:
 
     Attributes:
         state: of the network.
-        owners: the true element behind each track.
+        track_truth: the true element behind each track.
         labels: ``(B, T) int64``, what each track stood for in the last frame; the number of classes for nothing.
         lines: ``(B, T, 2 P)``, and where that was.
     """
 
     state: StreamState
-    owners: Owners
+    track_truth: TrackTruth
     labels: Tensor
     lines: Tensor
 
 
 def clip_losses(
     network: PredMapNet,
-    lookup: RigGeometry,
     clip: Sequence[ClipFrame],
     stage: ClipStage,
     settings: ClipSettings,
@@ -88,7 +86,6 @@ def clip_losses(
 
     Args:
         network: with MapTracker's decoder and BEV memory, in training mode.
-        lookup: of the rig that took the images.
         clip: frames in time order.
         stage: what is trained.
         settings: weights and noise.
@@ -109,10 +106,10 @@ def clip_losses(
         with torch.set_grad_enabled(stage.trains_images(number, len(clip))):
             images = network.encode_images(frame.inputs)
             _add(terms, _depth_terms(images, frame, settings))
-        bev = network.encode_bev(images, frame.inputs, lookup, seen)
+        bev = network.encode_bev(images, frame.inputs, seen)
         if not stage.vectors:
             _add(terms, _segmentation_terms(network.segmentation_head(bev.levels[0]), frame.targets))
-            maps = keep_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)
+            maps = store_bev_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)
             past.state = _with_maps(past.state, maps, frame.inputs.ego_to_global)
             continue
         outputs = network.decode_bev(bev, frame.inputs, seen)
@@ -130,7 +127,7 @@ def clip_losses(
 def _no_past(network: PredMapNet, batch: int) -> Past:
     state = network.initial_state(batch)
     nothing = state.instances
-    return Past(state, Owners.none(batch, network.device), nothing.labels, nothing.points.flatten(2))
+    return Past(state, TrackTruth.none(batch, network.device), nothing.labels, nothing.points.flatten(2))
 
 
 def _as_seen(
@@ -197,36 +194,40 @@ def _vector_terms(
     terms: dict[str, Tensor] = {}
     decoded = [layer for layer in outputs.layers if layer.logits is not None and layer.points is not None]
     assert decoded, "the decoder has layers"
-    valid = outputs.row_valid.flatten()
+    valid = outputs.query_valid.flatten()
     for layer in decoded:
         assert layer.logits is not None and layer.points is not None
         logits, lines = layer.logits, layer.points.flatten(2)
         assigned = _assign(logits, lines, orders, targets, outputs, past, owned)
         focal, distance = layer_losses(logits.flatten(0, 1), lines.flatten(0, 1), assigned, valid)
         _add(terms, {"focal": focal, "points": distance})
-    rows = outputs.row_valid.shape[1]
+    rows = outputs.query_valid.shape[1]
     pairs = Assignment(assigned.rows // rows, assigned.rows % rows, assigned.truth)
+    of_detections = _from_row(pairs, past.track_truth.kinds.shape[1])
     for layer in outputs.layers:
         if layer.masks is not None:
+            # Layers of the generator refine detections only: a track has one mask, in the last layer.
+            answering = pairs if layer is outputs.layers[-1] else of_detections
             masks = masks_of_size(targets.masks, layer.masks)
-            loss = mask_loss(layer.masks, masks, pairs, settings.mask_dice, settings.mask_entropy)
-            _add(terms, {"mask": loss})
-        if layer.points is None and layer.logits is not None:
-            # A query that was not decoded yet cannot know which elements tracks have taken: background is not asked.
-            found = layer.logits[pairs.frame, pairs.row]
-            wanted = functional.one_hot(targets.kinds[pairs.truth], found.shape[-1]).to(found.dtype)
-            _add(terms, {"generator": CLASS_WEIGHT * focal_loss(found, wanted).sum() / max(len(pairs), 1)})
+            loss = mask_loss(layer.masks, masks, answering, settings.mask_dice, settings.mask_entropy)
+            _add(terms, {"mask": loss * len(answering) / max(len(pairs), 1)})
     return terms, assigned
+
+
+def _from_row(pairs: Assignment, first: int) -> Assignment:
+    """Return the pairs of row ``first`` and later ones."""
+    kept = pairs.row >= first
+    return Assignment(pairs.frame[kept], pairs.row[kept], pairs.truth[kept])
 
 
 def _continued(outputs: FrameOutputs, targets: Targets, past: Past, network: PredMapNet) -> Tensor:
     """Return the truth ``(B, R) int64`` with which each track goes on; -1 for others. No two go on with one piece."""
-    tracks = past.owners.kinds.shape[1]
-    continued = torch.full_like(outputs.row_track_ids, -1)
+    tracks = past.track_truth.kinds.shape[1]
+    continued = torch.full_like(outputs.query_track_ids, -1)
     points = outputs.layers[-1].points
     assert points is not None
     size = points.new_tensor([network.config.roi_length, network.config.roi_width])
-    pairs = owned_truth(past.owners, outputs.row_valid[:, :tracks], points[:, :tracks], targets, size)
+    pairs = truth_of_tracks(past.track_truth, outputs.query_valid[:, :tracks], points[:, :tracks], targets, size)
     first = torch.full((len(targets),), tracks, device=continued.device)
     first = first.scatter_reduce(0, pairs.truth, pairs.row, "amin")
     keep = first[pairs.truth] == pairs.row
@@ -238,8 +239,8 @@ def _assign(
     logits: Tensor, lines: Tensor, orders: Tensor, targets: Targets, outputs: FrameOutputs, past: Past, owned: Tensor
 ) -> LayerTargets:
     """Assign the rows of all streams, one after the other."""
-    tracks = past.owners.kinds.shape[1]
-    detection = outputs.row_valid.clone()
+    tracks = past.track_truth.kinds.shape[1]
+    detection = outputs.query_valid.clone()
     detection[:, :tracks] = False
     pieces = torch.bincount(targets.frame, minlength=targets.batch).tolist()
     streams, begin = [], 0
@@ -247,7 +248,7 @@ def _assign(
         part = slice(begin, begin + count)
         here = torch.where(owned[stream] >= 0, owned[stream] - begin, -1)
         kinds = targets.kinds[part]
-        streams.append(assign(logits[stream], lines[stream], orders[part], kinds, detection[stream], here))
+        streams.append(assign_layer(logits[stream], lines[stream], orders[part], kinds, detection[stream], here))
         begin += count
     return stacked(streams, pieces)
 
@@ -280,12 +281,12 @@ def _next_tracks(
     """Make confident rows the tracks of the next frame: those that answer for truth, and false ones."""
     logits = outputs.layers[-1].logits
     assert logits is not None
-    keep = (logits.detach().sigmoid().amax(dim=-1) >= settings.track_score) & outputs.row_valid
+    keep = (logits.detach().sigmoid().amax(dim=-1) >= settings.track_score) & outputs.query_valid
     rows = (~keep).int().argsort(dim=1, stable=True)[:, : int(keep.sum(dim=1).max())]
     valid = keep.gather(1, rows)
-    born = keep & (outputs.row_track_ids < 0)
+    born = keep & (outputs.query_track_ids < 0)
     new_ids = past.state.next_track_id[:, None] + born.long().cumsum(dim=1) - 1
-    ids = torch.where(born, new_ids, outputs.row_track_ids)
+    ids = torch.where(born, new_ids, outputs.query_track_ids)
     instances = instances_from_rows(outputs, rows, valid, ids.gather(1, rows))
 
     batch, width = keep.shape
@@ -296,10 +297,14 @@ def _next_tracks(
         # One more entry stands for "none", so that -1 can be looked up.
         return functional.pad(values, (0, 1), value=-1)[truth]
 
+    if network.config.history_map.memory:
+        # Wrong poses are for the tracks of this frame; what is remembered of them lies where it was seen.
+        motion = relative_motion(frame.inputs.ego_to_global, past.state.ego_to_global)
+        outputs = replace(outputs, warped_history=network.history_memory.align(past.state.history_maps, motion))
     state = network.advance(past.state, outputs, instances, frame.inputs)
     return Past(
         state=state,
-        owners=Owners(known(frame.targets.kinds), known(frame.targets.element_ids)),
+        track_truth=TrackTruth(known(frame.targets.kinds), known(frame.targets.element_ids)),
         labels=assigned.labels.view(batch, width).gather(1, rows),
         lines=assigned.lines.view(batch, width, -1).take_along_dim(rows[..., None], dim=1),
     )
@@ -309,6 +314,6 @@ def _forecast(past: Past, coming: Targets, network: PredMapNet) -> Tensor:
     """L_pred: chamfer distance of forecasts and truth of the next frame, mean over the tracks still seen there."""
     forecasts = past.state.forecasts
     size = forecasts.new_tensor([network.config.roi_length, network.config.roi_width])
-    pairs = owned_truth(past.owners, past.state.instances.valid, forecasts, coming, size)
+    pairs = truth_of_tracks(past.track_truth, past.state.instances.valid, forecasts, coming, size)
     loss = forecast_loss(forecasts[pairs.frame, pairs.row], coming.points[pairs.truth], size)
     return loss / max(len(pairs), 1)

@@ -7,22 +7,21 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig, ResNet50Config
+from predmapnet.network.calibration import collate_calibrations, pad_cameras
 from predmapnet.network.image_input import input_size
-from predmapnet.network.maptracker.camera_pillars import LEVEL_STRIDES
+from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.small.backbone import STRIDE
-from predmapnet.network.state import RigGeometry
 from predmapnet.scenes import Rig
 from predmapnet.training.clip_losses import ClipFrame, clip_losses
-from predmapnet.training.clip_settings import ClipStage
 from predmapnet.training.data.augmentation import change_light, drop_camera
 from predmapnet.training.data.batches import RASTER_GRID, Batch, TrainingScenes
 from predmapnet.training.data.depth_targets import UNKNOWN, depth_targets
 from predmapnet.training.data.fill_cache import window_camera
 from predmapnet.training.data.targets import truth_targets
-from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import ClipStage, TrainingSettings
 from predmapnet.training.single_frame import frame_inputs
-from predmapnet.training.workers import Workers
 
 
 class ImageClips:
@@ -62,11 +61,12 @@ class ImageClips:
         valid = [drop_camera(len(frame.images), augmentation, generator) for frame in loaded]
         depth = None
         if config.depth.enabled:
-            depth = torch.from_numpy(np.stack([self._depth(scene, frame) for scene, frame in frames]))
+            depth = pad_cameras([self._depth(scene, frame) for scene, frame in frames])
         return Batch(
-            images=torch.from_numpy(np.stack(images)),
-            camera_valid=torch.from_numpy(np.stack(valid)),
+            images=pad_cameras(images),
+            camera_valid=pad_cameras(valid),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            calibration=collate_calibrations([frame.calibration for frame in loaded]),
             targets=truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, RASTER_GRID),
             depth=depth,
         )
@@ -85,7 +85,7 @@ class ImageClips:
 
 
 class ClipTraining:
-    """One stage of :data:`~predmapnet.training.clip_settings.CLIP_STAGES` for the training loop.
+    """One stage of :data:`~predmapnet.training.settings.CLIP_STAGES` for the training loop.
 
     Attributes:
         name: of the stage.
@@ -96,20 +96,18 @@ class ClipTraining:
         self,
         stage: ClipStage,
         network: PredMapNet,
-        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
-        workers: Workers,
+        processes: ProcessGroup,
     ) -> None:
-        clips = max(1, settings.batch // workers.size)
+        clips = max(1, settings.batch // processes.size)
         self.name = stage.name
         self.frames_per_step = clips * settings.clips.frames
         self._stage = stage
         self._network = network
-        self._lookup = lookup
         self._settings = settings
-        self._rank = workers.rank
-        self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, workers.rank))
+        self._rank = processes.rank
+        self.make_batch = ImageClips(scenes, network.config, settings, clips, (settings.seed, processes.rank))
 
     def begin(self) -> None:
         """Freeze what the stage leaves as it is."""
@@ -124,7 +122,7 @@ class ClipTraining:
         seed = np.random.default_rng([self._settings.seed, self._rank, 3, step]).integers(2**62)
         generator = torch.Generator().manual_seed(int(seed))
         clip = [clip_frame(instant, self._network) for instant in batch]
-        return clip_losses(self._network, self._lookup, clip, self._stage, self._settings.clips, step, generator)
+        return clip_losses(self._network, clip, self._stage, self._settings.clips, step, generator)
 
     def state(self) -> dict[str, Tensor]:
         """Nothing is carried from step to step."""

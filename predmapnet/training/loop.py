@@ -17,14 +17,13 @@ from torch import Tensor
 
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training import checkpoint
+from predmapnet.training import run_checkpoint
 from predmapnet.training.data.batches import prefetch
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, learning_rate, make_optimiser
-from predmapnet.training.settings import Budget, TrainingSettings
-from predmapnet.training.workers import Workers
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import Budget, Report, TrainingSettings
 
 Data = TypeVar("Data")
-Report = Callable[[str], None]
 Validate = Callable[[PredMapNet, str], dict[str, float]]
 """Called with the averaged network and the stage's name; returns metrics by name, none where nothing is measured."""
 
@@ -63,16 +62,16 @@ class Stage(Protocol[Data]):
 
 @dataclass
 class Position:
-    """Where a run stands.
+    """Progress of a run, as checkpoints keep it.
 
     Attributes:
         stage: name of the current stage.
-        step: optimiser steps of this stage.
-        frames: frames seen in all stages and processes.
+        step: optimiser steps of this stage so far.
+        frames: frames seen so far, in all stages and processes.
         seconds: wall time of this stage.
         total_seconds: wall time of the stages before.
-        cpu_seconds: of all processes and stages.
-        best: best validation mAP so far, by stage.
+        cpu_seconds: processor time of all processes and stages.
+        finished: names of the stages that are complete.
     """
 
     stage: str
@@ -94,13 +93,18 @@ class Trainer:
     """
 
     def __init__(
-        self, network: PredMapNet, settings: TrainingSettings, folder: Path, workers: Workers, report: Report = print
+        self,
+        network: PredMapNet,
+        settings: TrainingSettings,
+        folder: Path,
+        processes: ProcessGroup,
+        report: Report = print,
     ) -> None:
         self.network = network
         self.position = Position(stage="")
         self._settings = settings
         self._folder = folder
-        self._workers = workers
+        self._processes = processes
         self._report = report
         self._interrupted = False
         self._stored: Path | None = None
@@ -109,13 +113,13 @@ class Trainer:
 
     def resume(self) -> None:
         """Continue from the newest checkpoint. Raises UserError if there is none."""
-        self._stored = checkpoint.to_resume(self._folder)
-        stored = checkpoint.read_json(self._stored / "position.json")
+        self._stored = run_checkpoint.to_resume(self._folder)
+        stored = run_checkpoint.read_json(self._stored / "position.json")
         self.average.updates = stored.pop("average_updates")
         self.position = Position(**stored)
-        tensors = checkpoint.read(self._stored, "network")
-        checkpoint.load_weights(self.network, checkpoint.below_prefix("network", tensors), self._stored)
-        checkpoint.load_weights(self.average.network, checkpoint.below_prefix("average", tensors), self._stored)
+        tensors = run_checkpoint.read(self._stored, "network")
+        run_checkpoint.load_weights(self.network, run_checkpoint.below_prefix("network", tensors), self._stored)
+        run_checkpoint.load_weights(self.average.network, run_checkpoint.below_prefix("average", tensors), self._stored)
 
     def run(
         self, stage: Stage[Data], budget: Budget, optimiser_settings: OptimiserSettings, validate: Validate
@@ -135,7 +139,7 @@ class Trainer:
             return True
         optimiser = self._enter(stage, optimiser_settings)
         self.network.train()
-        position, workers = self.position, self._workers
+        position, processes = self.position, self._processes
         start, cpu_start = time.monotonic() - position.seconds, time.process_time()
         cpu_before = position.cpu_seconds
         last_saved = last_validated = position.seconds
@@ -147,13 +151,13 @@ class Trainer:
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 seconds = time.monotonic() - start
-                shared = workers.average_gradients(
+                shared = processes.average_gradients(
                     self.network,
                     [
                         budget.progress(step, seconds),
                         float(self._interrupted),
-                        float(workers.leads and seconds - last_saved > 60 * self._settings.checkpoint_minutes),
-                        float(workers.leads and seconds - last_validated > 60 * self._settings.validation_minutes),
+                        float(processes.leads and seconds - last_saved > 60 * self._settings.checkpoint_minutes),
+                        float(processes.leads and seconds - last_validated > 60 * self._settings.validation_minutes),
                         time.process_time() - cpu_start,
                     ],
                 )
@@ -165,20 +169,20 @@ class Trainer:
                 if not torch.isfinite(norm):
                     raise UserError(f"The loss of step {step} is not finite ({_readable(terms)}). Lower the rate.")
                 optimiser.step()
-                if workers.leads:
+                if processes.leads:
                     self.average.update(self.network)
                 position.step = step + 1
-                position.frames += stage.frames_per_step * workers.size
+                position.frames += stage.frames_per_step * processes.size
                 position.seconds = seconds
-                position.cpu_seconds = cpu_before + cpu_seconds * workers.size
+                position.cpu_seconds = cpu_before + cpu_seconds * processes.size
                 done = budget.progress(position.step, 0.0) >= 1 or progress >= 1
                 meter.add(terms, float(norm))
-                if workers.leads and (position.step % self._settings.log_steps == 0 or done):
+                if processes.leads and (position.step % self._settings.log_steps == 0 or done):
                     self._log({"lr": rate, **meter.means()}, progress)
                     meter = _Meter()
                 if validate_now or (done and not interrupted):
                     last_validated = seconds
-                    if workers.leads:
+                    if processes.leads:
                         figures = validate(self.average.network, stage.name)
                         if figures:
                             self._log({f"val_{name}": value for name, value in figures.items()}, progress)
@@ -196,11 +200,12 @@ class Trainer:
         position = self.position
         if position.stage == stage.name and self._stored is not None:
             stage.begin()
+            self.average.decay = settings.average_decay
             optimiser = make_optimiser(self.network, settings)
-            tensors = checkpoint.read(self._stored, "network")
-            checkpoint.restore_optimiser(optimiser, checkpoint.below_prefix("optimiser", tensors))
+            tensors = run_checkpoint.read(self._stored, "network")
+            run_checkpoint.restore_optimiser(optimiser, run_checkpoint.below_prefix("optimiser", tensors))
             torch.set_rng_state(tensors["random"])
-            stage.restore(checkpoint.read(self._stored, f"stage-{self._workers.rank}"))
+            stage.restore(run_checkpoint.read(self._stored, f"stage-{self._processes.rank}"))
             self._report(f"Stage {stage.name}: goes on at step {position.step}, frame {position.frames}.")
             return optimiser
         self._share_average()
@@ -214,29 +219,29 @@ class Trainer:
     def _share_average(self) -> None:
         """Give every process the averaged weights of process 0."""
         self.network.load_state_dict(self.average.network.state_dict())
-        self._workers.spread(self.network)
+        self._processes.spread(self.network)
 
     def _save(self, stage: Stage[Data], optimiser: torch.optim.Optimizer) -> None:
         """Write a checkpoint, all processes together."""
         order = len(self.position.finished) * 10_000_000 + self.position.step
-        if self._workers.leads:
-            checkpoint.prepare(self._folder, order)
-        self._workers.wait()
-        partial = checkpoint.partial_folder(self._folder, order)
-        checkpoint.write_tensors(partial / f"stage-{self._workers.rank}.safetensors", stage.state())
-        if self._workers.leads:
+        if self._processes.leads:
+            run_checkpoint.prepare(self._folder, order)
+        self._processes.wait()
+        partial = run_checkpoint.partial_folder(self._folder, order)
+        run_checkpoint.write_tensors(partial / f"stage-{self._processes.rank}.safetensors", stage.state())
+        if self._processes.leads:
             tensors = {
-                **checkpoint.with_prefix("network", self.network.state_dict()),
-                **checkpoint.with_prefix("average", self.average.network.state_dict()),
-                **checkpoint.with_prefix("optimiser", checkpoint.optimiser_tensors(optimiser)),
+                **run_checkpoint.with_prefix("network", self.network.state_dict()),
+                **run_checkpoint.with_prefix("average", self.average.network.state_dict()),
+                **run_checkpoint.with_prefix("optimiser", run_checkpoint.optimiser_tensors(optimiser)),
                 "random": torch.get_rng_state(),
             }
-            checkpoint.write_tensors(partial / "network.safetensors", tensors)
+            run_checkpoint.write_tensors(partial / "network.safetensors", tensors)
             stored = {**asdict(self.position), "average_updates": self.average.updates}
-            checkpoint.write_json(partial / "position.json", stored)
-        self._workers.wait()
-        if self._workers.leads:
-            self._stored = checkpoint.publish(partial)
+            run_checkpoint.write_json(partial / "position.json", stored)
+        self._processes.wait()
+        if self._processes.leads:
+            self._stored = run_checkpoint.publish(partial)
 
     def _log(self, values: dict[str, float], progress: float) -> None:
         """Append one line of metrics and show it."""

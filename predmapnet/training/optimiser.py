@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-Network = TypeVar("Network", bound=nn.Module)
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class OptimiserSettings:
         warmup_steps: until the peak is reached, on a line.
         warmup_start: part of the peak at which the line begins.
         clip_norm: largest norm of the gradient.
-        average_decay: of the moving average of the weights.
+        decay_all: norms, biases and other single rows are decayed as well.
+        average_decay: of the moving average of the weights; 0 for none, the average is the weights.
         final_fraction: part of the peak that is left at the end.
         rates: factors of the rate, by the beginning of the parameters' names; the longest counts, and 1 for others.
     """
@@ -32,6 +33,7 @@ class OptimiserSettings:
     learning_rate: float = 1e-3
     betas: tuple[float, float] = (0.9, 0.98)
     weight_decay: float = 0.02
+    decay_all: bool = False
     warmup_steps: int = 150
     warmup_start: float = 0.0
     clip_norm: float = 10.0
@@ -41,13 +43,14 @@ class OptimiserSettings:
 
 
 def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.optim.AdamW:
-    """AdamW over the trainable parameters; norms, biases and embeddings of one row are not decayed."""
+    """AdamW over the trainable parameters; norms, biases and embeddings of one row are decayed where asked for."""
     by_rate: dict[float, list[nn.Parameter]] = {1.0: []}
     for name, parameter in network.named_parameters():
         if parameter.requires_grad:
             by_rate.setdefault(_rate_of(name, settings.rates), []).append(parameter)
+    least = 0 if settings.decay_all else 2
     groups = [
-        {"params": [p for p in parameters if (p.ndim >= 2) == decays], "weight_decay": decay, "rate": rate}
+        {"params": [p for p in parameters if (p.ndim >= least) == decays], "weight_decay": decay, "rate": rate}
         for rate, parameters in by_rate.items()
         for decays, decay in ((True, settings.weight_decay), (False, 0.0))
     ]
@@ -74,7 +77,7 @@ def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> fl
     return settings.learning_rate * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
 
 
-class WeightAverage(Generic[Network]):
+class WeightAverage(Generic[_Network]):
     """Exponential moving average of a network's parameters and buffers.
 
     The decay starts low, ``(1 + updates) / (10 + updates)``, so that the average soon forgets the random start.
@@ -84,8 +87,8 @@ class WeightAverage(Generic[Network]):
         updates: how often it was updated.
     """
 
-    def __init__(self, network: Network, decay: float) -> None:
-        self.network: Network = copy.deepcopy(network).eval().requires_grad_(False)
+    def __init__(self, network: _Network, decay: float) -> None:
+        self.network: _Network = copy.deepcopy(network).eval().requires_grad_(False)
         self.decay = decay
         self.updates = 0
 

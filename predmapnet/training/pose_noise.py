@@ -1,4 +1,4 @@
-"""Wrong ego motion in training, so that tracks learn to find their element again (MapTracker's augmentation)."""
+"""Noise on the ego motion in training, so that tracks learn to find their element again (MapTracker's augmentation)."""
 
 from __future__ import annotations
 

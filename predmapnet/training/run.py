@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,23 +14,20 @@ from predmapnet.errors import UserError
 from predmapnet.machine import end_with_parent
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import load_config
-from predmapnet.training import checkpoint
-from predmapnet.training.clip_settings import CLIP_STAGES
+from predmapnet.training import run_checkpoint
 from predmapnet.training.clips import ClipTraining
 from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.data.fill_cache import DEMO, cache_folder, fill_demo_cache
-from predmapnet.training.data.scene_cache import read_scene
+from predmapnet.training.data.scene_cache import read_cached_scene
 from predmapnet.training.loop import Trainer
-from predmapnet.training.settings import TrainingSettings
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import CLIP_STAGES, Report, TrainingSettings
 from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
 from predmapnet.training.validation import validate
-from predmapnet.training.workers import Workers
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
 from predmapnet.weights.files import weights_hash
 from predmapnet.weights.inspection import parts_of
-
-Report = Callable[[str], None]
 
 WEIGHTS = "weights.safetensors"
 
@@ -94,7 +90,7 @@ def train(options: RunOptions, report: Report = print) -> Path | None:
     for process in others:
         process.start()
     try:
-        finished = _train_process(options, Workers(0, options.processes), meeting_point, report)
+        finished = _train_process(options, ProcessGroup(0, options.processes), meeting_point, report)
         for process in others:
             process.join()
     finally:
@@ -108,13 +104,13 @@ def export(options: RunOptions) -> Path:
     Raises:
         UserError: there is no checkpoint.
     """
-    newest = checkpoint.latest(options.folder)
+    newest = run_checkpoint.latest(options.folder)
     if newest is None:
         raise UserError(f"There is no checkpoint in {options.folder}.")
     network = PredMapNet(options.config)
-    average = checkpoint.below_prefix("average", checkpoint.read(newest, "network"))
-    checkpoint.load_weights(network, average, newest)
-    position = checkpoint.read_json(newest / "position.json")
+    average = run_checkpoint.below_prefix("average", run_checkpoint.read(newest, "network"))
+    run_checkpoint.load_weights(network, average, newest)
+    position = run_checkpoint.read_json(newest / "position.json")
     facts = {name: position[name] for name in ("frames", "finished", "cpu_seconds")}
     facts |= {"data": options.data, "towns": options.towns, "seed": options.settings.seed}
     if options.initial is not None:
@@ -127,49 +123,52 @@ def export(options: RunOptions) -> Path:
 def _other_process(options: RunOptions, rank: int, meeting_point: Path) -> None:
     """Body of every process but the first; it says nothing."""
     end_with_parent()
-    _train_process(options, Workers(rank, options.processes), meeting_point, lambda _line: None)
+    _train_process(options, ProcessGroup(rank, options.processes), meeting_point, lambda _line: None)
 
 
-def _train_process(options: RunOptions, workers: Workers, meeting_point: Path, report: Report) -> bool:
+def _train_process(options: RunOptions, processes: ProcessGroup, meeting_point: Path, report: Report) -> bool:
     """Run all stages in one process; return whether they were finished."""
     torch.set_num_threads(options.threads)
-    workers.join(meeting_point)
+    processes.join(meeting_point)
     try:
-        return _run_stages(options, workers, report)
+        return _run_stages(options, processes, report)
     finally:
-        workers.leave()
+        processes.leave()
 
 
-def _run_stages(options: RunOptions, workers: Workers, report: Report) -> bool:
+def _run_stages(options: RunOptions, processes: ProcessGroup, report: Report) -> bool:
     settings = options.settings
     torch.manual_seed(settings.seed)
     network = PredMapNet(options.config)
     if options.initial is not None and not options.resume:
         initial = load_checkpoint(options.initial).network.state_dict()
-        if fresh := checkpoint.start_from(network, initial, options.initial):
+        if fresh := run_checkpoint.start_from(network, initial, options.initial):
             report(f"Not in {options.initial.name}, so begun at random: {', '.join(parts_of(fresh))}.")
     network.to(options.device)
-    trainer = Trainer(network, settings, options.folder, workers, report)
+    trainer = Trainer(network, settings, options.folder, processes, report)
     if options.resume:
         trainer.resume()
-    scenes = TrainingScenes([read_scene(_cache(options) / name) for name in _names(options, "train")])
-    validation = [read_scene(_cache(options) / name) for name in _names(options, "val")] if workers.leads else []
-    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
+    scenes = TrainingScenes(
+        [read_cached_scene(_cache(options) / name) for name in _names(options, "train")], options.config
+    )
+    validation = (
+        [read_cached_scene(_cache(options) / name) for name in _names(options, "val")] if processes.leads else []
+    )
 
     def measure(average: PredMapNet, stage: str) -> dict[str, float]:
-        return validate(average, lookup, validation, streaming=stage != SingleFrameStage.name)
+        return validate(average, validation, streaming=stage != SingleFrameStage.name)
 
     for clip_stage, budget in settings.clip_stages:
-        clips = ClipTraining(clip_stage, network, lookup, scenes, settings, workers)
+        clips = ClipTraining(clip_stage, network, scenes, settings, processes)
         optimiser = replace(settings.clip_optimiser, rates=clip_stage.rates, final_fraction=clip_stage.final_rate)
         if not trainer.run(clips, budget, optimiser, measure if clip_stage.vectors else _no_measure):
             return False
     if settings.single is not None:
-        single = SingleFrameStage(network, lookup, scenes, settings, workers)
+        single = SingleFrameStage(network, scenes, settings, processes)
         if not trainer.run(single, settings.single, settings.optimiser, measure):
             return False
     if settings.temporal is not None:
-        temporal = TemporalStage(network, lookup, scenes, settings, options.folder, workers, report)
+        temporal = TemporalStage(network, scenes, settings, options.folder, processes, report)
         return trainer.run(temporal, settings.temporal, settings.temporal_optimiser, measure)
     return True
 
@@ -189,7 +188,7 @@ def _check_device(options: RunOptions) -> None:
 
 def _check_folder(options: RunOptions) -> None:
     """Refuse to mix runs, and to train tracks on a network that sees nothing."""
-    started = checkpoint.latest(options.folder) is not None
+    started = run_checkpoint.latest(options.folder) is not None
     if started and not options.resume:
         raise UserError(f"{options.folder} holds a run already. Go on with --resume, or choose another --out.")
     clips = options.settings.clip_stages
@@ -208,10 +207,12 @@ def _check_beginning(options: RunOptions) -> None:
     with torch.device("meta"):
         network = PredMapNet(options.config)
     if options.resume:
-        newest = checkpoint.to_resume(options.folder)
-        checkpoint.check_fit(network, checkpoint.below_prefix("network", checkpoint.read(newest, "network")), newest)
+        newest = run_checkpoint.to_resume(options.folder)
+        run_checkpoint.check_fit(
+            network, run_checkpoint.below_prefix("network", run_checkpoint.read(newest, "network")), newest
+        )
     elif options.initial is not None:
-        checkpoint.check_fit(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
+        run_checkpoint.check_fit(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
 
 
 def _cache(options: RunOptions) -> Path:

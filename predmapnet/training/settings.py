@@ -1,16 +1,22 @@
-"""Everything that decides how a run trains."""
+"""Settings of a training run: stages and their budgets, clips, streams, optimisers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.training.clip_settings import ClipSettings, ClipStage, choose_clip_stages, trains_in_clips
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.losses.lite import LossWeights
 from predmapnet.training.losses.matching import MatchingCosts
 from predmapnet.training.optimiser import OptimiserSettings
+
+Report = Callable[[str], None]
+"""Where lines for the user go."""
+
+BEV_PARTS = ("image_backbone", "bev_encoder", "segmentation_head", "depth_head")
 
 
 @dataclass(frozen=True)
@@ -61,22 +67,93 @@ class StreamSettings:
     capacity: int = 40
 
 
+@dataclass(frozen=True)
+class ClipSettings:
+    """Clips, noise and weights. Those of the baseline's own losses are constants of its module.
+
+    Attributes:
+        frames: of a clip.
+        span: the others are drawn from so many frames before the last one.
+        track_score: rows above it after a frame are the tracks of the next.
+        angle_noise: deviation of the Euler angles of the ego motion, radians.
+        distance_noise: deviation of its x and y, metres.
+        mask_dice, mask_entropy: lambda_dice and lambda_bce of Sec. 3.6.
+        forecast: weight of L_pred, per metre; the paper names none.
+        depth: weight of L_depth, as MapTRv2 has it.
+    """
+
+    frames: int = 5
+    span: int = 10
+    track_score: float = 0.4
+    angle_noise: float = 0.08
+    distance_noise: float = 0.25
+    mask_dice: float = 2.0
+    mask_entropy: float = 1.0
+    forecast: float = 1.0
+    depth: float = 3.0
+
+
+@dataclass(frozen=True)
+class ClipStage:
+    """What one stage trains.
+
+    Attributes:
+        name: of the stage.
+        epochs: of the paper on nuScenes (Sec. 4.1); they share out the time of a run.
+        vectors: polylines, tracks and all of the paper's modules; otherwise segmentation and depth only.
+        images: frames of a clip whose images are trained on; the others go through the image backbone without
+            gradient, to save memory.
+        frozen: parts of the network that do not change.
+        memory_from_step: the vector memory is not used before.
+        rates: factors of the learning rate, by the beginning of the parameters' names; the longest counts.
+        final_rate: part of the learning rate that is left at the end.
+    """
+
+    name: str
+    epochs: int
+    vectors: bool = True
+    images: Literal["first and last", "last", "none"] = "last"
+    frozen: tuple[str, ...] = ()
+    memory_from_step: int = 0
+    rates: Mapping[str, float] = field(default_factory=dict)
+    final_rate: float = 0.05
+
+    def trains_images(self, number: int, frames: int) -> bool:
+        """Whether the images of frame ``number`` of a clip are trained on."""
+        first, last = self.images == "first and last" and number == 0, number == frames - 1
+        return self.images != "none" and (first or last)
+
+
+SLOW_IMAGES = {"image_backbone.resnet": 0.1}
+CLIP_STAGES = (
+    ClipStage("bev", 18, vectors=False, images="first and last", rates=SLOW_IMAGES),
+    ClipStage("warmup", 6, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
+    ClipStage(
+        "joint",
+        48,
+        rates={**SLOW_IMAGES, "image_backbone": 0.5, "bev_encoder": 0.5, "bev_encoder.queries": 1.0}
+        | {"segmentation_head": 0.5},
+        final_rate=3e-3,
+    ),
+)
 CLIP_OPTIMISER = OptimiserSettings(
     learning_rate=5e-4,
     betas=(0.9, 0.999),
     weight_decay=0.01,
+    decay_all=True,
     warmup_steps=500,
     warmup_start=1 / 3,
     clip_norm=35.0,
+    average_decay=0.0,
 )
-"""MapTracker's; rates and the end come from the stage."""
+"""MapTracker's, which averages no weights; rates and the end come from the stage."""
 SINGLE_SHARE = 2 / 3
 """Of the time of a lite run, for its single-frame stage."""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """One run.
+    """Settings of one run.
 
     Attributes:
         batch: frames of one optimiser step of the single-frame stage, or clips of one step, over all processes.
@@ -85,6 +162,14 @@ class TrainingSettings:
         clip_stages: the stages of a network that trains in clips, each with its budget.
         validation_minutes, checkpoint_minutes: intervals.
         log_steps: steps between two lines of metrics.
+        weights: of the losses of the lite network.
+        costs: of the assignment of predictions to truth in the lite network.
+        optimiser: of the single-frame stage.
+        temporal_optimiser: of the temporal stage.
+        augmentation: changes to the images of all stages that read images; only the single-frame stage mirrors.
+        streams: of the temporal stage.
+        clips: clips, noise and loss weights of the clip stages.
+        clip_optimiser: of the clip stages; each stage adds its rates and its end.
     """
 
     batch: int = 6
@@ -154,3 +239,16 @@ def plan_run(
 
 def _with_rate(settings: OptimiserSettings, rate: float | None) -> OptimiserSettings:
     return settings if rate is None else replace(settings, learning_rate=rate)
+
+
+def trains_in_clips(config: PredMapNetConfig) -> bool:
+    """Whether a network is trained in clips (MapTracker's decoder) or in the two stages of ``lite``."""
+    return isinstance(config.decoder, MapTrackerDecoderConfig)
+
+
+def choose_clip_stages(name: str) -> tuple[ClipStage, ...]:
+    """Return one stage by name, or all of them for ``all``. Raises UserError for another name."""
+    names = [stage.name for stage in CLIP_STAGES]
+    if name != "all" and name not in names:
+        raise UserError(f"There is no stage '{name}' for this network. Choose: {', '.join(names)}, all.")
+    return tuple(stage for stage in CLIP_STAGES if name in ("all", stage.name))

@@ -8,16 +8,17 @@ from torch import Tensor
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, RigGeometry
+from predmapnet.network.state import FrameInputs
 from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
 from predmapnet.training.losses.lite import frame_losses
+from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import TrainingSettings
-from predmapnet.training.workers import Workers
 
 
 def frame_inputs(batch: Batch, config: PredMapNetConfig) -> FrameInputs:
     """Turn a batch of stored frames into what the network takes."""
-    return FrameInputs(normalise_images(batch.images, config.image), batch.camera_valid, batch.ego_to_global)
+    images = normalise_images(batch.images, config.image)
+    return FrameInputs(images, batch.camera_valid, batch.ego_to_global, batch.calibration)
 
 
 def roi_size(config: PredMapNetConfig) -> Tensor:
@@ -38,14 +39,12 @@ class SingleFrameStage:
     def __init__(
         self,
         network: PredMapNet,
-        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
-        workers: Workers,
+        processes: ProcessGroup,
     ) -> None:
-        self.frames_per_step = max(1, settings.batch // workers.size)
+        self.frames_per_step = max(1, settings.batch // processes.size)
         self._network = network
-        self._lookup = lookup
         self._settings = settings
         self._size = roi_size(network.config).to(network.device)
         self.make_batch = SingleFrameBatches(
@@ -54,7 +53,7 @@ class SingleFrameStage:
             network.config.roi,
             network.config.decoder.points,
             settings.augmentation,
-            (settings.seed, workers.rank),
+            (settings.seed, processes.rank),
         )
 
     def begin(self) -> None:
@@ -64,7 +63,7 @@ class SingleFrameStage:
     def losses(self, step: int, batch: Batch) -> dict[str, Tensor]:
         """Return the weighted losses of one batch."""
         batch = batch.to(self._network.device)
-        outputs = self._network(frame_inputs(batch, self._network.config), self._lookup, None)
+        outputs = self._network(frame_inputs(batch, self._network.config))
         settings = self._settings
         return frame_losses(outputs, batch.targets, self._size, settings.weights, settings.costs).terms
 

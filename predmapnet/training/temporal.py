@@ -14,18 +14,19 @@ from torch import Tensor
 from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
+from predmapnet.network.calibration import collate_calibrations
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, RigGeometry, StreamState
+from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.data.batches import TrainingScenes
-from predmapnet.training.data.streams import Clip, FeatureStore, StreamClips, StreamPlan
+from predmapnet.training.data.streams import FeatureStore, StreamPlan, StreamSegment, StreamSegments
 from predmapnet.training.data.targets import Targets
 from predmapnet.training.losses.lite import forecast_loss, forecast_point_loss, frame_losses
+from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import TrainingSettings
 from predmapnet.training.single_frame import roi_size
-from predmapnet.training.tracks import Chosen, Owners, choose_tracks, owned_truth
-from predmapnet.training.workers import Workers
+from predmapnet.training.track_truth import Chosen, TrackTruth, choose_tracks, truth_of_tracks
 
 ENCODE_BATCH = 4
 FROZEN = ("image_backbone", "bev_encoder", "depth_head")
@@ -44,26 +45,24 @@ class TemporalStage:
     def __init__(
         self,
         network: PredMapNet,
-        lookup: RigGeometry,
         scenes: TrainingScenes,
         settings: TrainingSettings,
         folder: Path,
-        workers: Workers,
+        processes: ProcessGroup,
         report: Callable[[str], None] = print,
     ) -> None:
         self.frames_per_step = settings.streams.streams * settings.streams.frames
         self._network = network
-        self._lookup = lookup
         self._scenes = scenes
         self._settings = settings
         self._folder = folder
-        self._workers = workers
+        self._processes = processes
         self._report = report
         self._size = roi_size(network.config).to(network.device)
         self._plan = StreamPlan.start(settings.streams.streams)
         self._state = network.initial_state(settings.streams.streams)
-        self._owners = Owners.none(settings.streams.streams, network.device)
-        self._clips: StreamClips | None = None
+        self._track_truth = TrackTruth.none(settings.streams.streams, network.device)
+        self._segments: StreamSegments | None = None
 
     def begin(self) -> None:
         """Freeze what makes BEV features and compute those of all frames once."""
@@ -79,51 +78,55 @@ class TemporalStage:
         shapes = tuple((width, *size) for width, size in zip(config.bev.widths, sizes, strict=True))
         store = FeatureStore(self._folder / self._fingerprint(), shapes)
         self._fill(store)
-        self._workers.wait()
-        seed = (self._settings.seed, self._workers.rank, 1)
-        self._clips = StreamClips(self._scenes, store, self._settings.streams, config.roi, config.decoder.points, seed)
-        self._clips.plan = self._plan
+        self._processes.wait()
+        seed = (self._settings.seed, self._processes.rank, 1)
+        self._segments = StreamSegments(
+            self._scenes, store, self._settings.streams, config.roi, config.decoder.points, seed
+        )
+        self._segments.plan = self._plan
 
-    def make_batch(self, step: int) -> Clip:
+    def make_batch(self, step: int) -> StreamSegment:
         """Return the next frames of all streams."""
-        assert self._clips is not None, "begin() comes first"
-        return self._clips(step)
+        assert self._segments is not None, "begin() comes first"
+        return self._segments(step)
 
-    def losses(self, step: int, batch: Clip) -> dict[str, Tensor]:
+    def losses(self, step: int, batch: StreamSegment) -> dict[str, Tensor]:
         """Return the weighted losses of the next frames, mean over frames, and carry the state on."""
         settings = self._settings.streams
-        generator = np.random.default_rng([self._settings.seed, self._workers.rank, 2, step])
+        generator = np.random.default_rng([self._settings.seed, self._processes.rank, 2, step])
         forgetful = torch.from_numpy(generator.random(settings.streams) < settings.state_dropout)
         batch = batch.to(self._network.device)
         state = forget(self._state, batch.fresh | forgetful.to(batch.fresh.device))
-        owners = self._owners
+        track_truth = self._track_truth
         terms: dict[str, Tensor] = {}
         following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
         for instant, features, coming in zip(batch.instants, batch.features, following, strict=True):
-            inputs = FrameInputs(features.levels[0].new_zeros(0), instant.camera_valid, instant.ego_to_global)
+            inputs = FrameInputs(instant.images, instant.camera_valid, instant.ego_to_global, instant.calibration)
             outputs = self._network.decode_bev(features, inputs, state)
             rows = state.instances.valid.shape[1]
             points = outputs.layers[-1].points
             assert points is not None
-            tracks = owned_truth(owners, outputs.row_valid[:, :rows], points[:, :rows], instant.targets, self._size)
+            tracks = truth_of_tracks(
+                track_truth, outputs.query_valid[:, :rows], points[:, :rows], instant.targets, self._size
+            )
             weights, costs = self._settings.weights, self._settings.costs
             found = frame_losses(outputs, instant.targets, self._size, weights, costs, tracks, rows)
-            chosen = choose_tracks(outputs, rows, owners, found.assignment, instant.targets, settings, generator)
+            chosen = choose_tracks(outputs, rows, track_truth, found.assignment, instant.targets, settings, generator)
             instances = named_instances(outputs, chosen, state)
             state = self._network.advance(state, outputs, instances, inputs)
-            owners = chosen.owners
+            track_truth = chosen.track_truth
             found.terms["forecast"] = self._forecast(state, chosen, coming)
             for name, term in found.terms.items():
                 share = term / len(batch.instants)
                 terms[name] = terms[name] + share if name in terms else share
-        self._state, self._owners, self._plan = detached(state), owners, batch.plan
+        self._state, self._track_truth, self._plan = detached(state), track_truth, batch.plan
         return terms
 
     def _forecast(self, state: StreamState, chosen: Chosen, coming: Targets) -> Tensor:
         """Prediction loss of the tracks whose element is still there in the next frame."""
         if self._network.future_guidance is None:
             return state.forecasts.new_zeros(())
-        pairs = owned_truth(chosen.owners, chosen.valid, state.forecasts, coming, self._size)
+        pairs = truth_of_tracks(chosen.track_truth, chosen.valid, state.forecasts, coming, self._size)
         forecasts, truth = state.forecasts[pairs.frame, pairs.row], coming.points[pairs.truth]
         rings = coming.kinds[pairs.truth] == ElementKind.PED_CROSSING
         loss = forecast_loss(forecasts, truth, self._size)
@@ -131,9 +134,9 @@ class TemporalStage:
         return self._settings.weights.forecast * loss / max(len(pairs), 1)
 
     def state(self) -> dict[str, Tensor]:
-        """Return plan, state and owners of the streams."""
+        """Return plan, state and true elements of the streams."""
         tensors = {f"plan.{name}": value for name, value in self._plan.tensors().items()}
-        tensors |= {f"owners.{name}": value for name, value in vars(self._owners).items()}
+        tensors |= {f"owners.{name}": value for name, value in vars(self._track_truth).items()}
         return tensors | {f"state.{name}": value for name, value in self._state.tensors().items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -145,10 +148,10 @@ class TemporalStage:
         self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
         tensors = {name: value.to(self._network.device) for name, value in tensors.items()}
         if "state.frame" in tensors:
-            self._owners = Owners(**part("owners."))
+            self._track_truth = TrackTruth(**part("owners."))
             self._state = StreamState.from_tensors(part("state."))
-        if self._clips is not None:
-            self._clips.plan = self._plan
+        if self._segments is not None:
+            self._segments.plan = self._plan
 
     def _fingerprint(self) -> str:
         """Name of the frozen weights, so that features of others are never mixed in."""
@@ -164,7 +167,7 @@ class TemporalStage:
         """Encode the scenes that are not stored yet, shared out over the processes."""
         self._network.eval()
         missing = [index for index in range(len(self._scenes.scenes)) if not store.has(index)]
-        for done, scene in enumerate(mine := missing[self._workers.rank :: self._workers.size]):
+        for done, scene in enumerate(mine := missing[self._processes.rank :: self._processes.size]):
             frames = len(self._scenes.scenes[scene])
             with store.writing(scene, frames) as values:
                 for start in range(0, frames, ENCODE_BATCH):
@@ -174,10 +177,11 @@ class TemporalStage:
                     normalised = normalise_images(images, self._network.config.image)
                     valid = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
                     anywhere = torch.zeros(stop - start, 4, 4, dtype=torch.float64, device=images.device)
-                    inputs = FrameInputs(normalised, valid, anywhere)
-                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs, self._lookup)
+                    calibration = collate_calibrations([frame.calibration for frame in loaded]).to(images.device)
+                    inputs = FrameInputs(normalised, valid, anywhere, calibration)
+                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs)
                     values[start:stop] = store.pack(features)
-            if self._workers.leads and done % 10 == 9:
+            if self._processes.leads and done % 10 == 9:
                 self._report(f"BEV features: {done + 1}/{len(mine)} scenes of this process")
 
 

@@ -31,6 +31,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import input_size
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.matrix_product import linear
@@ -83,14 +84,15 @@ class Drive:
     state: StreamState | None = None
 
     def __post_init__(self) -> None:
-        self.lookup = self.network.make_rig_lookup(DEMO_RIG)
+        self.calibration = calibrate(DEMO_RIG, self.network.config)
+        self.geometry = self.network.view_geometry(self.calibration)
 
     def inputs(self, frame: int) -> FrameInputs:
         """Return the inputs of a frame."""
         pose = torch.eye(4, dtype=torch.float64)[None].clone()
         pose[0, 0, 3] = METRES_PER_FRAME * frame
         images = torch.randn(1, len(DEMO_RIG), 3, *input_size(self.network.config.image))
-        return FrameInputs(images, torch.ones(1, len(DEMO_RIG), dtype=torch.bool), pose)
+        return FrameInputs(images, torch.ones(1, len(DEMO_RIG), dtype=torch.bool), pose, self.calibration)
 
     def step(self, inputs: FrameInputs, ledger: Ledger, images: object = None) -> object:
         """Map one frame; return the image features, which another network of the same backbone may take."""
@@ -98,7 +100,7 @@ class Drive:
         with ledger.watching(network), ledger.running(THE_REST):
             if images is None:
                 images = network.encode_images(inputs)
-            bev = network.encode_bev(images, inputs, self.lookup, self.state)
+            bev = network.encode_bev(images, inputs, self.state, self.geometry)
             outputs = network.decode_bev(bev, inputs, self.state)
             select(outputs, self.state, network.config)
             self.state = network.advance(self.state, outputs, first_rows(outputs), inputs)

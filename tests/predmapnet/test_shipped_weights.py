@@ -13,7 +13,7 @@ from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene, read_scene
+from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene
 from predmapnet.training.validation import map_frames, validate
 from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED
@@ -32,16 +32,15 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Rendered:
     network = load_checkpoint().network
     folder = tmp_path_factory.mktemp("towns") / "scene-0002"
     cache_demo_scene(folder, network.config)
-    return Rendered(network, read_scene(folder))
+    return Rendered(network, read_cached_scene(folder))
 
 
 def mean_ap(rendered: Rendered, *, streaming: bool, **tracking: object) -> float:
     config: PredMapNetConfig = rendered.network.config
     changed = config.tracking.model_copy(update=tracking)
-    lookup = rendered.network.make_rig_lookup(rendered.scene.rig)
     rendered.network.config = config.model_copy(update={"tracking": changed})
     try:
-        return validate(rendered.network, lookup, [rendered.scene], streaming)["mAP"]
+        return validate(rendered.network, [rendered.scene], streaming)["mAP"]
     finally:
         rendered.network.config = config
 
@@ -51,21 +50,22 @@ def test_the_file_is_small():
 
 
 def test_streaming_is_at_least_as_good_as_single_frames(rendered: Rendered):
-    streaming = mean_ap(rendered, streaming=True)
-    assert streaming >= mean_ap(rendered, streaming=False) - 0.01
-    assert streaming >= 0.35
+    streaming, single = mean_ap(rendered, streaming=True), mean_ap(rendered, streaming=False)
+    assert streaming >= single
+    # It is 0.8783. Masked attention switched off leaves 0.8505, history maps warped the wrong way round 0.8670.
+    assert streaming >= 0.875
+    assert single >= 0.78  # It is 0.7846.
 
 
 def test_without_merging_tracks_and_detections_repeat_each_other(rendered: Rendered):
-    assert mean_ap(rendered, streaming=True, merge=False) < mean_ap(rendered, streaming=True) - 0.05
+    assert mean_ap(rendered, streaming=True, merge=False) < 0.875 - 0.2
 
 
 def test_the_map_of_a_drive_is_found_and_right(rendered: Rendered):
     scene, roi = rendered.scene, rendered.network.config.roi
     drive = trajectory(scene.name)
-    lookup = rendered.network.make_rig_lookup(scene.rig)
     integrator = MapIntegrator()
-    for frame_map in map_frames(rendered.network, lookup, scene, range(len(scene)), streaming=True):
+    for frame_map in map_frames(rendered.network, scene, range(len(scene)), streaming=True):
         integrator.add(frame_map)
     poses = drive.ego_to_global @ LIDAR_TO_EGO
     truth = truth_map(
@@ -73,5 +73,5 @@ def test_the_map_of_a_drive_is_found_and_right(rendered: Rendered):
     )
     quality = global_map_quality(integrator.map(), truth, seen_area(list(scene.ego_to_global), roi)).overall
     at_one_metre = THRESHOLDS.index(1.0)
-    assert quality.precision[at_one_metre] >= 0.75
-    assert quality.recall[at_one_metre] >= 0.70
+    assert quality.precision[at_one_metre] >= 0.88  # It is 0.895.
+    assert quality.recall[at_one_metre] >= 0.81  # It is 0.819.

@@ -1,4 +1,4 @@
-"""Image backbone and BEV encoder compiled by torch, which fuses what lies between the products."""
+"""Compilation of the image backbone and the BEV encoder by torch, which fuses what lies between the products."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A network that only infers, and does so faster."""
+"""Faster copy of a network that only infers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from predmapnet.network.kernels.normalised_convolution import NormalisedConvolut
 from predmapnet.network.layers import ConvNorm
 from predmapnet.network.maptracker.resnet import DeformableUnit
 
-Network = TypeVar("Network", bound=nn.Module)
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
-def for_inference(network: Network) -> Network:
+def for_inference(network: _Network) -> _Network:
     """Return a copy in evaluation mode, in which norms with fixed statistics are part of the kernels before them.
 
     Its results are the same but for rounding. It cannot be trained, and its state dict is its own.

@@ -1,4 +1,4 @@
-"""Image backbone and BEV encoder in bfloat16, for machines that multiply such numbers faster.
+"""bfloat16 in the image backbone and the BEV encoder, for machines that multiply such numbers faster.
 
 Only the products are: convolutions and linear layers, which are nearly all of the work. What decides where something is
 looked up (sampling offsets, attention weights), the look-ups themselves, norms, and everything after the BEV encoder
@@ -11,9 +11,12 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.machine import Precision
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
-from predmapnet.network.maptracker.bevformer import BevSelfAttention, ImageCrossAttention
+from predmapnet.network.maptracker.bevformer import BevFormer, BevSelfAttention, ImageCrossAttention
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.small.bev_encoder import BevEncoder
+from predmapnet.network.state import ViewGeometry
 
 
 def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:
@@ -41,6 +44,11 @@ class _LowPrecision(nn.Module):
                 for name, parameter in module.named_parameters(recurse=False):
                     low = nn.Parameter(parameter.to(torch.bfloat16), requires_grad=False)
                     module.register_parameter(name, low)
+
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> ViewGeometry:
+        """Return the geometry of the BEV encoder, which is exact."""
+        assert isinstance(self.part, BevEncoder | BevFormer)
+        return self.part.geometry(calibration, size)
 
     def forward(self, *arguments: object) -> list[Tensor]:
         """Compute what the part computes."""

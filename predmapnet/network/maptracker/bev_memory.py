@@ -1,4 +1,4 @@
-"""Past BEV maps for the BEV encoder: kept, chosen by distance, and warped into the current ego frame."""
+"""BEV memory of the MapTracker encoder: past maps are kept, chosen by distance, warped to the present, and fused."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from predmapnet.config import EncoderBevMemoryConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.history_choice import choose_history
+from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 from predmapnet.network.layers import cell_centres
+from predmapnet.network.maptracker.strided_selection import select_strided
 from predmapnet.network.state import StreamState
 
 
 @dataclass
-class BevHistory:
+class PastBevMaps:
     """Chosen past maps, from far to near.
 
     Attributes:
@@ -30,7 +31,34 @@ class BevHistory:
     valid: Tensor
 
 
-def look_back(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> BevHistory:
+class BevMemoryFusion(nn.Module):
+    """A convolution over the past maps and the current one, and a residual block; its output is a residual, >= 0."""
+
+    def __init__(self, width: int, slots: int) -> None:
+        super().__init__()
+        self.slots = slots
+        self.mix = NormalisedConvolution((slots + 1) * width, width, 3)
+        self.first = NormalisedConvolution(width, width, 3)
+        self.second = NormalisedConvolution(width, width, 3)
+
+    def forward(self, history: Tensor, current: Tensor) -> Tensor:
+        """Fuse.
+
+        Args:
+            history: ``(B, S, C, H, W)``, from far to near; fewer maps than slots count as zero maps in front.
+            current: ``(B, C, H, W)``.
+
+        Returns:
+            ``(B, C, H, W)``, to be added to ``current``.
+        """
+        batch, maps, width = history.shape[:3]
+        missing = current.new_zeros(batch, self.slots - maps, width, *current.shape[2:])
+        together = torch.cat([missing, history, current[:, None]], dim=1).flatten(1, 2)
+        hidden = F.relu(self.mix(together.contiguous(memory_format=torch.channels_last)))
+        return F.relu(self.second(F.relu(self.first(hidden))) + hidden)
+
+
+def warp_past_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> PastBevMaps:
     """Choose past maps and warp them.
 
     Args:
@@ -45,7 +73,7 @@ def look_back(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfi
     grid = warp_grid(current_to_past, config).flatten(0, 1).to(maps.dtype)
     warped = F.grid_sample(maps.flatten(0, 1), grid, mode="bilinear", padding_mode="zeros", align_corners=False)
     warped = warped.unflatten(0, slots.shape).masked_fill(~chosen[:, :, None, None, None], 0.0)
-    return BevHistory(warped, slots, chosen)
+    return PastBevMaps(warped, slots, chosen)
 
 
 def choose_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> tuple[Tensor, Tensor]:
@@ -57,7 +85,7 @@ def choose_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetCon
         config: distances.
     """
     travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1)
-    return choose_history(travelled, state.bev_memory_valid, config.temporal_bev.distances, fallback="latest")
+    return select_strided(travelled, state.bev_memory_valid, config.temporal_bev.distances, fallback="latest")
 
 
 def nearest_pose(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> Tensor:
@@ -75,7 +103,7 @@ def nearest_pose(state: StreamState, ego_to_global: Tensor, config: PredMapNetCo
     return state.bev_memory_pose[stream, slots[:, -1]]
 
 
-def keep_map(
+def store_bev_map(
     state: StreamState, bev: Tensor, ego_to_global: Tensor, config: EncoderBevMemoryConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Store the current map; the oldest goes when the memory is full.

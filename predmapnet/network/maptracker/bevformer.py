@@ -11,13 +11,18 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.matrix_product import Linear
 from predmapnet.network.layers import ResidualPerceptron, flatten_cells
-from predmapnet.network.maptracker.bev_memory import look_back
-from predmapnet.network.maptracker.camera_pillars import CameraPillars, pixel_positions
-from predmapnet.network.maptracker.temporal_fusion import TemporalFusion
-from predmapnet.network.state import FrameInputs, RigGeometry, StreamState
+from predmapnet.network.maptracker.bev_memory import BevMemoryFusion, warp_past_maps
+from predmapnet.network.maptracker.reference_points import (
+    ReferencePoints,
+    find_references,
+    pillar_points,
+    pixel_positions,
+)
+from predmapnet.network.state import FrameInputs, StreamState, ViewGeometry
 
 IMAGE_LEVELS = 3
 LEVEL_CODES = 4
@@ -93,48 +98,37 @@ class ImageCrossAttention(nn.Module):
         self.output = Linear(width, width)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, cells: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor) -> Tensor:
+    def forward(self, cells: Tensor, tokens: Tensor, references: ReferencePoints, camera_valid: Tensor) -> Tensor:
         """Attend: the mean over the cameras that see a cell and are valid.
 
         Args:
             cells: ``(B, H * W, C)``.
             tokens: ``(B, N, pixels of all levels, C)``.
-            pillars: of the rig.
+            references: of the calibration of these frames.
             camera_valid: ``(B, N) bool``.
 
         Returns:
             ``(B, H * W, C)``, the input included.
         """
         valid = camera_valid.to(cells.dtype)
-        cameras = (valid @ pillars.sees.to(cells.dtype).T).clamp(min=1.0)
-        seen = self.look(cells, tokens, pillars) * valid[:, pillars.camera, None]
-        summed = torch.zeros_like(cells).index_add(1, pillars.cell, seen)
+        cameras = (references.visible & camera_valid[:, :, None]).sum(dim=1).clamp(min=1)
+        seen = self.look(cells, tokens, references) * valid.flatten()[references.camera, None]
+        summed = torch.zeros_like(cells.flatten(0, 1)).index_add(0, references.cell, seen).view_as(cells)
         return cells + self.dropout(self.output(summed / cameras[..., None]))
 
-    def look(self, cells: Tensor, tokens: Tensor, pillars: CameraPillars) -> Tensor:
-        """Return what each cell finds in each camera that sees it: ``(B, P, C)``."""
-        batch, pairs = len(cells), len(pillars.camera)
+    def look(self, cells: Tensor, tokens: Tensor, references: ReferencePoints) -> Tensor:
+        """Return what each cell finds in each camera that sees it: ``(P, C)``."""
         values = self.value(tokens).view(-1, self.heads, cells.shape[-1] // self.heads)
         weights = self.attention_weights(cells).unflatten(-1, (self.heads, -1)).softmax(dim=-1)
-        weights = weights.unflatten(-1, (IMAGE_LEVELS, self.POINTS))[:, pillars.cell]
+        weights = weights.unflatten(-1, (IMAGE_LEVELS, self.POINTS)).flatten(0, 1)[references.cell]
         offsets = self.sampling_offsets(cells).unflatten(-1, (self.heads, IMAGE_LEVELS, self.POINTS, 2))
-        offsets = offsets[:, pillars.cell]
+        offsets = offsets.flatten(0, 1)[references.cell]
         # Points take the heights of the pillar in turns: 0, 1, 2, 3, 0, 1, 2, 3.
-        heights = pillars.positions.shape[1]
-        references = pixel_positions(pillars.positions, pillars.level_sizes).transpose(1, 2)
-        references = references.repeat(1, 1, self.POINTS // heights, 1)
-        places = (offsets + references[:, None]).flatten(0, 1)
-        camera_rows = pillars.camera.int() * pillars.tokens
-        first_row = _stream_rows(batch, pairs, tokens.shape[1] * pillars.tokens, cells.device).view(batch, pairs)
-        found = deformable_attention(
-            values,
-            (first_row + camera_rows).flatten(),
-            places[..., 0],
-            places[..., 1],
-            weights.flatten(0, 1),
-            pillars.level_sizes,
-        )
-        return found.view(batch, pairs, -1)
+        heights = references.positions.shape[1]
+        pixels = pixel_positions(references.positions, references.level_sizes).transpose(1, 2)
+        x, y = (offsets + pixels.repeat(1, 1, self.POINTS // heights, 1)[:, None]).unbind(-1)
+        first_row = references.camera.int() * references.tokens
+        return deformable_attention(values, first_row, x, y, weights, references.level_sizes)
 
 
 class BevEncoderLayer(nn.Module):
@@ -146,14 +140,20 @@ class BevEncoderLayer(nn.Module):
         self.image_attention = ImageCrossAttention(config)
         self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(3))
-        self.fusion = TemporalFusion(config.width, past_maps)
+        self.fusion = BevMemoryFusion(config.width, past_maps)
 
     def forward(
-        self, cells: Tensor, code: Tensor, tokens: Tensor, pillars: CameraPillars, camera_valid: Tensor, history: Tensor
+        self,
+        cells: Tensor,
+        code: Tensor,
+        tokens: Tensor,
+        references: ReferencePoints,
+        camera_valid: Tensor,
+        history: Tensor,
     ) -> Tensor:
         """Map cells ``(B, H * W, C)`` to ``(B, H * W, C)``; ``history`` is ``(B, S, C, H, W)``."""
         cells = self.norms[0](self.self_attention(cells, code))
-        cells = self.norms[1](self.image_attention(cells, tokens, pillars, camera_valid))
+        cells = self.norms[1](self.image_attention(cells, tokens, references, camera_valid))
         cells = self.norms[2](self.perceptron(cells))
         bev = _as_map(cells, history.shape[-2:])
         return flatten_cells(bev + self.fusion(history, bev))
@@ -176,25 +176,31 @@ class BevFormer(nn.Module):
         self.camera_code = nn.Parameter(torch.randn(len(bev.cameras), width))
         past_maps, mirrored = len(config.temporal_bev.distances), config.quirks.mirrored_self_attention
         self.layers = nn.ModuleList(BevEncoderLayer(bev, past_maps, mirrored) for _ in range(bev.layers))
+        self.register_buffer("pillars", pillar_points(bev, config.roi), persistent=False)
+        self.pillars: Tensor
+
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> ReferencePoints:
+        """Find where the cameras of some frames, whose input has ``size`` (rows, columns), see the BEV cells."""
+        return find_references(calibration.ego_to_image, size, self.pillars)
 
     def forward(
-        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: RigGeometry, state: StreamState
+        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState
     ) -> list[Tensor]:
         """Encode.
 
         Args:
             levels: image features ``(B, N, C, h_i, w_i)``, fine to coarse.
             inputs: which cameras count, and poses.
-            geometry: pillars of the rig.
+            geometry: of :meth:`geometry`.
             state: of the last frame; its maps take part.
 
         Returns:
             A single level ``(B, C, H, W)``, channels-last in memory.
         """
-        assert isinstance(geometry, CameraPillars), "a rig's pillars come from make_rig_lookup"
-        history = look_back(state, inputs.ego_to_global, self.config)
+        assert isinstance(geometry, ReferencePoints), "the geometry comes from this encoder"
+        history = warp_past_maps(state, inputs.ego_to_global, self.config)
         cells = self.first_queries(history.maps, history.valid)
-        code, tokens = self.position_code(), self.image_tokens(levels)
+        code, tokens = self.position_code(), self.image_tokens(levels, inputs.calibration.camera_code)
         for layer in self.layers:
             cells = layer(cells, code, tokens, geometry, inputs.camera_valid, history.maps)
         return [_as_map(cells, self.grid)]
@@ -216,10 +222,10 @@ class BevFormer(nn.Module):
         row = self.row_code[:, None].expand(-1, columns, -1)
         return torch.cat([column, row], dim=-1).flatten(0, 1)
 
-    def image_tokens(self, levels: Sequence[Tensor]) -> Tensor:
-        """Return all pixels ``(B, N, pixels of all levels, C)`` with the codes of their camera and level."""
+    def image_tokens(self, levels: Sequence[Tensor], cameras: Tensor) -> Tensor:
+        """Return all pixels ``(B, N, pixels of all levels, C)`` with the codes of their camera ``(B, N)`` and level."""
         tokens = [
-            features.permute(0, 1, 3, 4, 2).flatten(2, 3) + (self.camera_code[:, None] + code)
+            features.permute(0, 1, 3, 4, 2).flatten(2, 3) + (self.camera_code[cameras][:, :, None] + code)
             for features, code in zip(levels, self.level_code[: len(levels)], strict=True)
         ]
         return torch.cat(tokens, dim=2)

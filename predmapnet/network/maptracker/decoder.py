@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
-from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.matrix_product import Linear
 from predmapnet.network.layers import ResidualPerceptron
-from predmapnet.network.maptracker.vector_memory import Recalled
+from predmapnet.network.map_decoder import DecoderInput, MapDecoder
+from predmapnet.network.maptracker.vector_memory import RecalledQueries
 
 
 class LineCrossAttention(nn.Module):
@@ -67,7 +67,7 @@ class MemoryAttention(nn.Module):
         self.attention = _multihead(config)
         self.dropout = nn.Dropout(config.dropout)
 
-    def forward(self, tracks: Tensor, memory: Recalled) -> Tensor:
+    def forward(self, tracks: Tensor, memory: RecalledQueries) -> Tensor:
         """Map tracks ``(B, T, C)`` to ``(B, T, C)``, the input included."""
         # A padded row has no entries; it attends to zeros instead of to nothing.
         blocked = ~memory.valid & memory.valid.any(dim=-1, keepdim=True)
@@ -103,7 +103,7 @@ class MapTrackerDecoderLayer(nn.Module):
         self.perceptron = ResidualPerceptron(config.width, config.hidden, config.dropout)
         self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(4))
 
-    def forward(self, rows: Tensor, points: Tensor, start: DecoderRows, cells: Tensor) -> Tensor:
+    def forward(self, rows: Tensor, points: Tensor, start: DecoderInput, cells: Tensor) -> Tensor:
         """Refine.
 
         Args:
@@ -121,7 +121,7 @@ class MapTrackerDecoderLayer(nn.Module):
             rows = self._with_memory(self.norms[1](seen), start.memory)
         return self.norms[3](self.perceptron(self.norms[2](rows)))
 
-    def _with_memory(self, rows: Tensor, memory: Recalled | None) -> Tensor:
+    def _with_memory(self, rows: Tensor, memory: RecalledQueries | None) -> Tensor:
         """Replace the track rows, the first ones, by what their memory makes of them."""
         assert memory is not None
         tracks = memory.queries.shape[1]
@@ -130,7 +130,7 @@ class MapTrackerDecoderLayer(nn.Module):
         return torch.cat([self.memory_attention(rows[:, :tracks], memory), rows[:, tracks:]], dim=1)
 
 
-class MapTrackerDecoder(RowDecoder):
+class MapTrackerDecoder(MapDecoder):
     """All layers, with one classifier and one polyline branch for all of them."""
 
     learns_start = True
@@ -155,8 +155,8 @@ class MapTrackerDecoder(RowDecoder):
             nn.Linear(2 * width, 2 * decoder.points),
         )
 
-    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode, as :class:`RowDecoder` says."""
+    def forward(self, start: DecoderInput, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Decode, as :class:`MapDecoder` says."""
         cells = self.bev_cells(bev)
         rows, points, predictions = start.queries, start.points, []
         for layer in self.layers:

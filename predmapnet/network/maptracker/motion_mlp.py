@@ -1,4 +1,4 @@
-"""Carries track queries from one ego frame to another (MapTracker's query propagation)."""
+"""Motion perceptron: carries track queries from one ego frame to another (MapTracker's query propagation)."""
 
 from __future__ import annotations
 

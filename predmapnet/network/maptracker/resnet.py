@@ -1,20 +1,21 @@
-"""Image features, large: ResNet-50 as MapTracker uses it (caffe style, deformable in the last two stages)."""
+"""Image backbone of MapTracker: ResNet-50 (caffe style, deformable in the last two stages) and a feature pyramid."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from predmapnet.config import ResNet50Config
-from predmapnet.network.feature_pyramid import FeaturePyramid
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 
 BLOCKS = (3, 4, 6, 3)
-WIDTHS = (64, 128, 256, 512)
+STAGE_WIDTHS = (64, 128, 256, 512)
 EXPANSION = 4
 DEFORMABLE = (False, False, True, True)
-LEVEL_WIDTHS = tuple(EXPANSION * width for width in WIDTHS[1:])
+LEVEL_WIDTHS = tuple(EXPANSION * width for width in STAGE_WIDTHS[1:])
 """Channels of the three levels that are returned, at strides 8, 16 and 32."""
 
 
@@ -55,10 +56,10 @@ class ResNet50(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = NormalisedConvolution(3, WIDTHS[0], 7, stride=2)
+        self.stem = NormalisedConvolution(3, STAGE_WIDTHS[0], 7, stride=2)
         self.pool = nn.MaxPool2d(3, stride=2, padding=1)
-        stages, channels = [], WIDTHS[0]
-        for stage, (blocks, width, deformable) in enumerate(zip(BLOCKS, WIDTHS, DEFORMABLE, strict=True)):
+        stages, channels = [], STAGE_WIDTHS[0]
+        for stage, (blocks, width, deformable) in enumerate(zip(BLOCKS, STAGE_WIDTHS, DEFORMABLE, strict=True)):
             first = Bottleneck(channels, width, 1 if stage == 0 else 2, deformable)
             channels = EXPANSION * width
             rest = [Bottleneck(channels, width, 1, deformable) for _ in range(blocks - 1)]
@@ -81,6 +82,23 @@ class ResNet50(nn.Module):
             features = stage(features)
             levels.append(features)
         return levels[1:]
+
+
+class FeaturePyramid(nn.Module):
+    """Feature pyramid (Lin et al. 2017) with batch norm: coarse levels inform fine ones, all get the same width."""
+
+    def __init__(self, widths: Sequence[int], width: int) -> None:
+        super().__init__()
+        self.lateral = nn.ModuleList(NormalisedConvolution(channels, width, 1) for channels in widths)
+        self.smooth = nn.ModuleList(NormalisedConvolution(width, width, 3) for _ in widths)
+
+    def forward(self, levels: Sequence[Tensor]) -> list[Tensor]:
+        """Map levels ``(N, C_i, h_i, w_i)``, fine to coarse, to ``(N, C, h_i, w_i)``."""
+        merged = [lateral(level) for lateral, level in zip(self.lateral, levels, strict=True)]
+        for level in reversed(range(len(merged) - 1)):
+            size = merged[level].shape[-2:]
+            merged[level] = merged[level] + F.interpolate(merged[level + 1], size, mode="nearest")
+        return [smooth(level) for smooth, level in zip(self.smooth, merged, strict=True)]
 
 
 class ResNet50Pyramid(nn.Module):

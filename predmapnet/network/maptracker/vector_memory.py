@@ -1,4 +1,4 @@
-"""Memory of the queries of each track, and its recall in the current ego frame (MapTracker's vector memory)."""
+"""Vector memory (MapTracker): queries of each track in past frames, and their recall in the current ego frame."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_pose
-from predmapnet.network.history_choice import choose_history
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
+from predmapnet.network.maptracker.strided_selection import select_strided
 from predmapnet.network.state import VectorMemory
 
 
 @dataclass
-class Recalled:
+class RecalledQueries:
     """Chosen entries of each track, carried into the current frame.
 
     Attributes:
@@ -48,9 +48,9 @@ def empty_vector_memory(batch: int, config: PredMapNetConfig, device: torch.devi
     )
 
 
-def recall(
+def recall_queries(
     memory: VectorMemory, motion: MotionMlp, ego_to_global: Tensor, frame: Tensor, distances: Sequence[float]
-) -> Recalled:
+) -> RecalledQueries:
     """Choose entries of each track by distance and carry them into the current ego frame.
 
     Args:
@@ -63,7 +63,7 @@ def recall(
     # Released weights know the noise that rounded global coordinates leave in the finest sines of the motion code.
     current = ego_to_global.to(memory.poses.dtype)[:, None, None]
     travelled = (memory.poses[..., :2, 3] - current[..., :2, 3]).norm(dim=-1)
-    slots, valid = choose_history(travelled, memory.valid, distances, fallback="nearest")
+    slots, valid = select_strided(travelled, memory.valid, distances, fallback="nearest")
     first = (~valid).int().argsort(dim=-1, stable=True)
     slots, valid = slots.gather(-1, first), valid.gather(-1, first)
 
@@ -73,7 +73,7 @@ def recall(
     carried = motion(queries, pose.to(queries.dtype)).masked_fill(~valid[..., None], 0.0).detach()
     age = frame[:, None, None] - memory.frames.gather(-1, slots)
     code = age_code(age.masked_fill(~valid, 0), queries.shape[-1]).masked_fill(~valid[..., None], 0.0)
-    return Recalled(carried, code, valid, slots, pose)
+    return RecalledQueries(carried, code, valid, slots, pose)
 
 
 def age_code(age: Tensor, width: int) -> Tensor:
@@ -83,7 +83,7 @@ def age_code(age: Tensor, width: int) -> Tensor:
     return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
-def remember(
+def store_queries(
     memory: VectorMemory,
     queries: Tensor,
     source: Tensor,

@@ -1,4 +1,4 @@
-"""Image features, small: a residual network and a feature pyramid to stride 4."""
+"""Image backbone of the small network: a residual network and a feature pyramid to stride 4."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""BEV features: ground look-up of the image features, a position map and a U-Net over three levels."""
+"""BEV encoder of the small network: ground look-up of image features, a position map and a U-Net over three levels."""
 
 from __future__ import annotations
 
@@ -8,20 +8,37 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.config import LookupBevConfig
-from predmapnet.network.layers import ConvNorm, Convolution, ResidualBlock
-from predmapnet.network.small.ground_lookup import RigLookup, to_ground
-from predmapnet.network.state import FrameInputs, RigGeometry, StreamState
+from predmapnet.config import LookupBevConfig, PredMapNetConfig
+from predmapnet.network.calibration import Calibration
+from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.layers import ConvNorm, Convolution, ResidualBlock, zero_init
+from predmapnet.network.small.backbone import STRIDE
+from predmapnet.network.small.ground_lookup import GroundLookup, find_on_ground, ground_points, to_ground
+from predmapnet.network.state import FrameInputs, StreamState, ViewGeometry
 
 
 class BevEncoder(nn.Module):
-    """Ground features at 0.3 m to three levels at 0.6, 1.2 and 2.4 m."""
+    """Ground features at 0.3 m to three levels at 0.6, 1.2 and 2.4 m.
 
-    def __init__(self, channels_in: int, config: LookupBevConfig) -> None:
+    At further heights each cell looks into the images once; what it finds enters through a product that starts as zero.
+    """
+
+    def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        fine, middle, coarse = config.widths
+        bev, channels_in = config.bev, config.backbone.channels
+        assert isinstance(bev, LookupBevConfig)
+        fine, middle, coarse = bev.widths
+        self.fine_grid, grid = (2 * bev.rows, 2 * bev.columns), (bev.rows, bev.columns)
+        points = [ground_points(self.fine_grid, 0.0, config.roi)]
+        points += [ground_points(grid, height, config.roi) for height in bev.further_heights]
+        self.register_buffer("points", torch.cat(points), persistent=False)
+        self.points: Tensor
         self.reduce = Convolution(channels_in, fine, 2, stride=2, bias=False)
-        self.position = nn.Parameter(torch.randn(fine, config.rows, config.columns) * 0.02)
+        self.heights: Linear | None = None
+        if bev.further_heights:
+            self.heights = Linear(len(bev.further_heights) * channels_in, fine, bias=False)
+            zero_init(self.heights)
+        self.position = nn.Parameter(torch.randn(fine, *grid) * 0.02)
         self.norm = nn.BatchNorm2d(fine)
         self.fine_in = ResidualBlock(fine, fine)
         self.middle_in = ResidualBlock(fine, middle, stride=2)
@@ -31,28 +48,43 @@ class BevEncoder(nn.Module):
         self.middle_to_fine = ConvNorm(middle, fine, 1, relu=False)
         self.fine_out = ResidualBlock(fine, fine)
 
+    def geometry(self, calibration: Calibration, size: tuple[int, int]) -> GroundLookup:
+        """Find where the cameras of some frames, whose input has ``size`` (rows, columns), see the ground."""
+        features = -(-size[0] // STRIDE), -(-size[1] // STRIDE)
+        return find_on_ground(self.points, calibration, features, STRIDE)
+
     def forward(
-        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: RigGeometry, state: StreamState | None
+        self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState | None
     ) -> list[Tensor]:
         """Encode.
 
         Args:
             levels: image features of a single level, ``(B, N, C_in, h', w')``.
             inputs: which cameras count.
-            geometry: look-up of the rig.
-            state: not used; here past maps come in after the encoder (:mod:`predmapnet.network.small.bev_memory`).
+            geometry: of :meth:`geometry`.
+            state: not used; past maps enter afterwards (:mod:`predmapnet.network.small.residual_bev_memory`).
 
         Returns:
             ``(B, C_0, H, W)``, ``(B, C_1, H / 2, W / 2)`` and ``(B, C_2, H / 4, W / 4)``, sizes rounded up.
         """
-        assert isinstance(geometry, RigLookup), "a rig's look-up comes from make_rig_lookup"
-        ground = to_ground(levels[0], inputs.camera_valid, geometry)
-        fine = self.fine_in(F.relu(self.norm(self.reduce(ground) + self.position)))
+        assert isinstance(geometry, GroundLookup), "the geometry comes from this encoder"
+        found = to_ground(levels[0], inputs.camera_valid, geometry)
+        fine = self.fine_in(F.relu(self.norm(self._combined(found) + self.position)))
         middle = self.middle_in(fine)
         coarse = self.coarse(middle)
         middle = self.middle_out(middle + _resize(self.coarse_to_middle(coarse), middle))
         fine = self.fine_out(fine + _resize(self.middle_to_fine(middle), fine))
         return [fine, middle, coarse]
+
+    def _combined(self, found: Tensor) -> Tensor:
+        """Turn the features of all points ``(B, K, C_in)`` into those of the cells ``(B, C_0, H, W)``."""
+        road = found[:, : self.fine_grid[0] * self.fine_grid[1]]
+        cells = self.reduce(road.unflatten(1, self.fine_grid).permute(0, 3, 1, 2))
+        if self.heights is None:
+            return cells
+        rows, columns = cells.shape[-2:]
+        raised = found[:, road.shape[1] :].unflatten(1, (-1, rows, columns))
+        return cells + self.heights(raised.permute(0, 2, 3, 1, 4).flatten(-2)).permute(0, 3, 1, 2)
 
 
 def _resize(features: Tensor, like: Tensor) -> Tensor:

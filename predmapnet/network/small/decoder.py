@@ -1,4 +1,4 @@
-"""Map decoder: queries look along their polylines in the BEV features and move every point, layer by layer."""
+"""Map decoder of the small network: queries look along their polylines in the BEV and move every point."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from torch import Tensor, nn
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PointDecoderConfig, PredMapNetConfig
-from predmapnet.network.decoder_rows import DecoderRows, RowDecoder
-from predmapnet.network.layers import Attention, FeedForward, Perceptron, Pointwise, sine_code, zero_init
-
-FREQUENCIES = 6
+from predmapnet.network.layers import (
+    SINE_FREQUENCIES,
+    Attention,
+    FeedForward,
+    Perceptron,
+    Pointwise,
+    sine_code,
+    zero_init,
+)
+from predmapnet.network.map_decoder import DecoderInput, MapDecoder
 
 
 class PointMixing(nn.Module):
@@ -39,7 +45,7 @@ class PointLayer(nn.Module):
         self.roi_size: Tensor
         self.self_attention = Attention(width, config.heads)
         self.self_norm = nn.LayerNorm(width)
-        self.place = nn.Linear(4 * FREQUENCIES + 4, point_width)
+        self.place = nn.Linear(4 * SINE_FREQUENCIES + 4, point_width)
         self.index_code = nn.Parameter(torch.randn(config.points, point_width) * 0.1)
         self.from_query = nn.Linear(width, point_width)
         self.offsets = nn.Linear(point_width, 2 * config.sampling_offsets)
@@ -93,10 +99,10 @@ class PointLayer(nn.Module):
         """Encode where each point is and which way the line goes from it."""
         steps = torch.diff(references, dim=2) * self.roi_size / 10.0
         steps = torch.cat([F.pad(steps, (0, 0, 1, 0)), F.pad(steps, (0, 0, 0, 1))], dim=-1)
-        return self.place(torch.cat([sine_code(references, FREQUENCIES), steps], dim=-1))
+        return self.place(torch.cat([sine_code(references, SINE_FREQUENCIES), steps], dim=-1))
 
 
-class MapDecoder(RowDecoder):
+class PointDecoder(MapDecoder):
     """Layers of point refinement over the finest BEV level; references are detached before each layer."""
 
     learns_start = False
@@ -109,8 +115,8 @@ class MapDecoder(RowDecoder):
         self.input = Pointwise(config.bev.widths[0], decoder.point_width)
         self.layers = nn.ModuleList(PointLayer(decoder, config.roi) for _ in range(decoder.layers))
 
-    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode, as :class:`RowDecoder` says."""
+    def forward(self, start: DecoderInput, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Decode, as :class:`MapDecoder` says."""
         queries, references = start.queries, start.points
         detections = queries.shape[1] - start.track_valid.shape[1]
         allowed = visible_rows(start.track_valid, detections, self.one_way)

@@ -1,25 +1,21 @@
-"""From image features to the ground plane: a sparse look-up that is computed once per camera rig."""
+"""Ground look-up: image features at cells of the ground, by a sparse product made from the calibration of a frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
-from mapfusion.arrays import Float
-from predmapnet.config import PredMapNetConfig
-from predmapnet.network.image_input import input_size, window_intrinsics
+from mapfusion.elements import RegionOfInterest
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.layers import cell_centres
-from predmapnet.network.small.backbone import STRIDE
-from predmapnet.scenes import Rig
 
-Integer = NDArray[np.int64]
+NEAREST_DEPTH = 0.1
+"""Metres before the camera from which on a point is seen."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +23,8 @@ class SparseRows:
     """A sparse matrix, row by row.
 
     Attributes:
-        columns: ``(nnz,) int64``.
-        starts: ``(rows,) int64``, where each row begins in ``columns``.
+        columns: ``(nnz,) int32``.
+        starts: ``(rows,) int32``, where each row begins in ``columns``.
         weights: ``(nnz,) float32``.
     """
 
@@ -39,130 +35,132 @@ class SparseRows:
     def transposed(self, columns: int) -> SparseRows:
         """Return the transpose of a matrix with that many columns."""
         counts = torch.diff(self.starts, append=self.starts.new_tensor([len(self.columns)]))
-        rows = torch.arange(len(self.starts), device=counts.device).repeat_interleave(counts)
+        rows = torch.arange(len(self.starts), device=counts.device, dtype=torch.int32).repeat_interleave(counts)
         order = torch.argsort(self.columns, stable=True)
-        counts = torch.bincount(self.columns, minlength=columns)
-        return SparseRows(rows[order], torch.cumsum(counts, 0) - counts, self.weights[order])
+        starts = row_starts(torch.bincount(self.columns, minlength=columns))
+        return SparseRows(rows.index_select(0, order), starts, self.weights.index_select(0, order))
 
     def multiply(self, table: Tensor) -> Tensor:
         """Multiply with ``(columns, C)``; an embedding bag is several times faster than a CSR product on a CPU."""
         return F.embedding_bag(self.columns, table, self.starts, per_sample_weights=self.weights, mode="sum")
 
-    def to(self, device: torch.device | str) -> SparseRows:
-        """Return a copy on ``device``."""
-        return SparseRows(self.columns.to(device), self.starts.to(device), self.weights.to(device))
-
 
 @dataclass(frozen=True)
-class RigLookup:
-    """Which image features each ground cell sees. Belongs to a rig, not to the network; not trained.
+class GroundLookup:
+    """Image features that each point of the ground sees, in ``B`` frames of ``N`` cameras and ``K`` points.
 
     Attributes:
-        gather: ground cells x feature pixels of all cameras: bilinear weights, summed over cameras.
-        pixels: of the features of all cameras, as many as ``gather`` has columns.
-        visible: ``(cells, N) float32``, 1 where a camera sees the centre of a cell.
-        grid: rows and columns of ground cells.
-        feature_size: rows and columns of the image features.
+        gather: points of all frames x feature pixels of all cameras of all frames: bilinear weights, summed over the
+            cameras of a frame.
+        pixels: as many as ``gather`` has columns.
+        visible: ``(B, K, N) float32``, 1 where a camera sees a point.
     """
 
     gather: SparseRows
     pixels: int
     visible: Tensor
-    grid: tuple[int, int]
-    feature_size: tuple[int, int]
 
     @cached_property
     def scatter(self) -> SparseRows:
         """The transpose of ``gather``, for the backward pass."""
         return self.gather.transposed(self.pixels)
 
-    def to(self, device: torch.device | str) -> RigLookup:
-        """Return a copy on ``device``."""
-        return replace(self, gather=self.gather.to(device), visible=self.visible.to(device))
+
+def ground_points(grid: tuple[int, int], height: float, roi: RegionOfInterest) -> Tensor:
+    """Return the centres of the cells of a grid, at a height above the road.
+
+    Returns:
+        ``(rows * columns, 4) float64``: x and y in metres of the ego frame, height above the road, and 1.
+    """
+    x, y = ((cell_centres(*grid).double() - 0.5) * torch.tensor(roi.size)).flatten(0, 1).unbind(-1)
+    return torch.stack([x, y, torch.full_like(x, height), torch.ones_like(x)], dim=-1)
 
 
-def make_rig_lookup(rig: Rig, config: PredMapNetConfig) -> RigLookup:
-    """Project the centres of all ground cells (at the height of the road under the car) into all cameras.
+def find_on_ground(
+    points: Tensor, calibration: Calibration, feature_size: tuple[int, int], stride: int
+) -> GroundLookup:
+    """Project points of the ground into all cameras of all frames.
 
     Args:
-        rig: cameras at the size of their stored images; scaling and the window are taken care of here.
-        config: image and grid sizes.
+        points: ``(K, 4) float64`` of :func:`ground_points`.
+        calibration: of the ``B`` frames.
+        feature_size: rows and columns of the image features.
+        stride: pixels of the network's input per pixel of the features.
     """
-    grid = (2 * config.bev.rows, 2 * config.bev.columns)
-    size = -(-np.array(input_size(config.image)) // STRIDE)
-    ground = (cell_centres(*grid).double().numpy().reshape(-1, 2) - 0.5) * config.roi.size
-    pixels, seen = _project(ground, rig, config)
-    cell, camera = np.nonzero(seen)  # cell after cell, so that the entries of each row follow one another
-    corners, shares = _bilinear(pixels[cell, camera] / STRIDE - 0.5, *size)
-    corners += camera[:, None] * size.prod()
-    entries = 4 * seen.sum(axis=1)
-    return RigLookup(
+    batch, cameras = calibration.camera_code.shape
+    u, v, depth = _project(points, calibration)
+    width, height = calibration.image_size[:, None].unbind(-1)
+    seen = (depth > NEAREST_DEPTH) & (u >= 0) & (v >= 0) & (u < width * depth) & (v < height * depth)
+    # Point after point, so that the entries of each row follow one another.
+    entry = seen.flatten().nonzero()[:, 0]
+    u, v, depth = (value.flatten().index_select(0, entry) for value in (u, v, depth))
+    corners, shares = _bilinear(u / depth / stride - 0.5, v / depth / stride - 0.5, *feature_size)
+    frame, camera = entry // (len(points) * cameras), entry % cameras
+    pixels = feature_size[0] * feature_size[1]
+    first_pixel = ((frame * cameras + camera) * pixels).int()
+    return GroundLookup(
         gather=SparseRows(
-            columns=torch.from_numpy(corners.ravel()),
-            starts=torch.from_numpy(entries.cumsum() - entries),
-            weights=torch.from_numpy(shares.ravel().astype(np.float32)),
+            columns=(corners + first_pixel[:, None]).flatten(),
+            starts=row_starts(4 * seen.sum(dim=-1).flatten()),
+            weights=shares.flatten().float(),
         ),
-        pixels=len(rig) * int(size.prod()),
-        visible=torch.from_numpy(seen.astype(np.float32)),
-        grid=grid,
-        feature_size=(int(size[0]), int(size[1])),
+        pixels=batch * cameras * pixels,
+        visible=seen.float(),
     )
 
 
-def _project(ground: Float, rig: Rig, config: PredMapNetConfig) -> tuple[Float, NDArray[np.bool_]]:
-    """Return pixels ``(n, N, 2)`` in the network's window of each camera, and whether each point is inside it."""
-    # On a plane, a projection is a matrix that multiplies (x, y, 1).
-    planes = []
-    for camera in rig:
-        rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
-        to_camera = np.column_stack([rotation.T[:, :2], rotation.T @ ([0.0, 0.0, camera.ground_height] - position)])
-        planes.append(window_intrinsics(camera, config.image) @ to_camera)
-    projected = (np.column_stack([ground, np.ones(len(ground))]) @ np.concatenate(planes).T).reshape(len(ground), -1, 3)
-    depth = projected[..., 2]
-    pixels = projected[..., :2] / np.maximum(depth, 1e-3)[..., None]
-    inside = (pixels >= 0) & (pixels < [config.image.width, config.image.height])
-    return pixels, (depth > 0.1) & inside[..., 0] & inside[..., 1]
+def row_starts(entries: Tensor) -> Tensor:
+    """Return where each row of a sparse matrix begins, ``(rows,) int32``, of its number of entries."""
+    return (entries.cumsum(0) - entries).int()
 
 
-def _bilinear(pixels: Float, rows: int, columns: int) -> tuple[Integer, Float]:
-    """Return the four neighbours ``(n, 4)`` of each position (flat index, clamped at the border) and their weights."""
-    base = np.floor(pixels)
-    right, down = (pixels - base).T
-    left_x, top_y = base.T
-    x = np.clip([left_x, left_x, left_x + 1, left_x + 1], 0, columns - 1)
-    y = np.clip([top_y, top_y + 1, top_y, top_y + 1], 0, rows - 1)
-    weights = [(1 - right) * (1 - down), (1 - right) * down, right * (1 - down), right * down]
-    return np.ascontiguousarray((y * columns + x).astype(np.int64).T), np.ascontiguousarray(np.transpose(weights))
+def _project(points: Tensor, calibration: Calibration) -> tuple[Tensor, Tensor, Tensor]:
+    """Return u depth, v depth and depth, ``(B, K, N) float64`` each."""
+    matrices = calibration.ego_to_image
+    at_road = matrices[..., 3] + matrices[..., 2] * calibration.ground_height[..., None]
+    matrices = torch.cat([matrices[..., :3], at_road[..., None]], dim=-1)
+    u, v, depth = (points @ matrices.permute(0, 2, 3, 1)).unbind(1)
+    return u, v, depth
+
+
+def _bilinear(x: Tensor, y: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+    """Return the four neighbours ``(n, 4) int32`` of each position (flat, clamped at the border) and their weights."""
+    left, top = x.floor(), y.floor()
+    right, down = x - left, y - top
+    left, top = left.int(), top.int()
+    near_x, far_x = left.clamp(0, columns - 1), (left + 1).clamp(0, columns - 1)
+    near_y, far_y = top.clamp(0, rows - 1) * columns, (top + 1).clamp(0, rows - 1) * columns
+    corners = torch.stack([near_y + near_x, far_y + near_x, near_y + far_x, far_y + far_x], dim=-1)
+    shares = [(1 - right) * (1 - down), (1 - right) * down, right * (1 - down), right * down]
+    return corners, torch.stack(shares, dim=-1)
 
 
 class _SparseProduct(torch.autograd.Function):
-    """Multiply each stream's features with the sparse matrix; the transpose serves the backward pass."""
+    """Multiply features with the sparse matrix; the transpose serves the backward pass."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, lookup: RigLookup) -> Tensor:
+    def forward(ctx: Any, table: Tensor, lookup: GroundLookup) -> Tensor:
         ctx.lookup = lookup
-        return torch.stack([lookup.gather.multiply(table) for table in features])
+        return lookup.gather.multiply(table)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return torch.stack([ctx.lookup.scatter.multiply(table) for table in gradient.contiguous()]), None
+        return ctx.lookup.scatter.multiply(gradient.contiguous()), None
 
 
-def to_ground(features: Tensor, camera_valid: Tensor, lookup: RigLookup) -> Tensor:
-    """Look image features up at every ground cell: the mean over the cameras that see it and are valid.
+def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> Tensor:
+    """Look image features up at every point of the ground: the mean over the cameras that see it and are valid.
 
     Args:
         features: ``(B, N, C, h', w')``.
         camera_valid: ``(B, N) bool``.
-        lookup: of the rig that took the images.
+        lookup: of the calibration of these frames.
 
     Returns:
-        ``(B, C, rows, columns)``, channels-last in memory; zero where no valid camera looks.
+        ``(B, K, C)``; zero where no valid camera looks.
     """
-    batch = len(features)
     features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
-    pixels = features.permute(0, 1, 3, 4, 2).reshape(batch, -1, features.shape[2]).to(lookup.gather.weights.dtype)
-    summed = _SparseProduct.apply(pixels, lookup)  # type: ignore[no-untyped-call]
-    cameras = camera_valid.to(summed.dtype) @ lookup.visible.to(summed.dtype).T
-    ground = summed / cameras.clamp(min=1.0)[..., None]
-    return ground.unflatten(1, lookup.grid).permute(0, 3, 1, 2)
+    table = features.permute(0, 1, 3, 4, 2).reshape(-1, features.shape[2]).to(lookup.gather.weights.dtype)
+    summed = _SparseProduct.apply(table, lookup)  # type: ignore[no-untyped-call]
+    cameras = lookup.visible.to(summed.dtype) @ camera_valid.to(summed.dtype)[..., None]
+    return summed.unflatten(0, cameras.shape[:2]) / cameras.clamp(min=1.0)

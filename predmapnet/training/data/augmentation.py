@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -18,9 +17,9 @@ from predmapnet.training.data.photography import (
     save_and_load,
     tone_tables,
 )
+from predmapnet.training.data.scene_cache import Images
 
 Float = NDArray[np.float64]
-Images = NDArray[np.uint8]
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""
@@ -31,9 +30,9 @@ class AugmentationSettings:
     """How strongly frames are changed.
 
     Attributes:
-        mirror: probability of swapping left and right (only for rigs that are symmetric).
+        mirror: probability of swapping left and right.
         photography: light, lenses, sensors and files.
-        camera_dropout: probability that one camera of a frame is missing.
+        camera_dropout: probability that one camera of a frame is missing; a single one never is.
     """
 
     mirror: float = 0.5
@@ -41,14 +40,13 @@ class AugmentationSettings:
     camera_dropout: float = 0.05
 
 
-def mirror_images(images: Images, order: Sequence[int]) -> Images:
-    """Return what the rig sees in the mirrored world.
+def mirror_images(images: Images) -> Images:
+    """Return what the mirrored rig (:func:`predmapnet.network.image_input.mirror_rig`) sees in the mirrored world.
 
     Args:
         images: ``(N, h, w, 3)``.
-        order: of :func:`predmapnet.network.image_input.mirror_order`.
     """
-    return np.ascontiguousarray(images[list(order)][:, :, ::-1])
+    return np.ascontiguousarray(images[:, :, ::-1])
 
 
 def mirror_truth(truth: FrameTruth) -> FrameTruth:
@@ -82,8 +80,8 @@ def change_light(images: Images, settings: AugmentationSettings, generator: np.r
 
 
 def drop_camera(cameras: int, settings: AugmentationSettings, generator: np.random.Generator) -> NDArray[np.bool_]:
-    """Draw which cameras work: ``(cameras,) bool``, at most one is False."""
+    """Draw which cameras work: ``(cameras,) bool``, at most one is False, and never all."""
     valid = np.ones(cameras, dtype=np.bool_)
-    if generator.random() < settings.camera_dropout:
+    if generator.random() < settings.camera_dropout and cameras > 1:
         valid[generator.integers(cameras)] = False
     return valid

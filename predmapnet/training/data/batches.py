@@ -1,4 +1,4 @@
-"""What one optimiser step sees. Every draw depends on seed, process and step only, so a resumed run repeats it."""
+"""Batches of one optimiser step. Every draw depends on seed, process and step only, so a resumed run repeats it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mapfusion.elements import ElementKind, RegionOfInterest
+from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import mirror_order
+from predmapnet.network.calibration import Calibration, calibrate, collate_calibrations, pad_cameras
+from predmapnet.network.image_input import mirror_rig
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.augmentation import (
     AugmentationSettings,
@@ -25,7 +27,7 @@ from predmapnet.training.data.augmentation import (
     mirror_pose,
     mirror_truth,
 )
-from predmapnet.training.data.scene_cache import CachedScene, same_rig
+from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.data.targets import Targets, truth_targets
 
 Item = TypeVar("Item")
@@ -38,12 +40,13 @@ CROSSING_WEIGHT = 2.5
 
 @dataclass
 class Batch:
-    """Frames of ``B`` streams at one instant.
+    """Frames of ``B`` streams at one instant, of any cars; ``N`` is the largest number of cameras.
 
     Attributes:
-        images: ``(B, N, h, w, 3) uint8``, or without rows where features are cached.
-        camera_valid: ``(B, N) bool``.
+        images: ``(B, N, h, w, 3) uint8``; without cameras where features are cached.
+        camera_valid: ``(B, N) bool``; False for missing cameras and in padding.
         ego_to_global: ``(B, 4, 4) float64``.
+        calibration: of the cameras.
         targets: truth of these frames.
         depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.training.data.depth_targets.depth_targets`, or None.
     """
@@ -51,6 +54,7 @@ class Batch:
     images: Tensor
     camera_valid: Tensor
     ego_to_global: Tensor
+    calibration: Calibration
     targets: Targets
     depth: Tensor | None = None
 
@@ -60,6 +64,7 @@ class Batch:
             images=self.images.to(device),
             camera_valid=self.camera_valid.to(device),
             ego_to_global=self.ego_to_global.to(device),
+            calibration=self.calibration.to(device),
             targets=self.targets.to(device),
             depth=None if self.depth is None else self.depth.to(device),
         )
@@ -67,32 +72,37 @@ class Batch:
 
 @dataclass(frozen=True)
 class LoadedFrame:
-    """One frame of the cache after the exact augmentations."""
+    """One frame of the cache after the exact augmentations.
+
+    Attributes:
+        images: ``(N, h, w, 3) uint8``; without cameras where nobody asked for them.
+        ego_to_global: ``(4, 4) float64``.
+        calibration: of the cameras, as a batch of one.
+        truth: of the frame.
+    """
 
     images: NDArray[np.uint8]
     ego_to_global: NDArray[np.float64]
+    calibration: Calibration
     truth: FrameTruth
 
 
 class TrainingScenes:
-    """The cached scenes of one data set and rig, with mirroring.
+    """Cached scenes of any cars, with mirroring.
 
     Attributes:
-        scenes: all of one rig.
-        can_mirror: whether the rig is symmetric.
+        scenes: all of them; each has a rig of its own.
+        frame_index: ``(n, 2) int64``: scene and frame of every frame.
+        frame_probability: ``(n,)``, how often each is drawn.
     """
 
-    def __init__(self, scenes: Sequence[CachedScene]) -> None:
+    def __init__(self, scenes: Sequence[CachedScene], config: PredMapNetConfig) -> None:
         if not scenes:
             raise UserError("There is no scene to train on. Choose another data set or more towns.")
-        other = next((scene for scene in scenes if not same_rig(scene.rig, scenes[0].rig)), None)
-        if other is not None:
-            raise UserError(
-                f"Scenes {scenes[0].name} and {other.name} have different cameras; a run trains on one rig at a time."
-            )
         self.scenes = tuple(scenes)
-        self._mirror_order = mirror_order(scenes[0].rig)
-        self.can_mirror = self._mirror_order is not None
+        self._calibrations = [
+            (calibrate(scene.rig, config), calibrate(mirror_rig(scene.rig), config)) for scene in scenes
+        ]
         self.frame_index = np.array([(s, f) for s, scene in enumerate(scenes) for f in range(len(scene))])
         crossings = [ElementKind.PED_CROSSING in truth.kinds for scene in scenes for truth in scene.truths]
         weights = np.where(crossings, CROSSING_WEIGHT, 1.0)
@@ -100,12 +110,12 @@ class TrainingScenes:
 
     def load(self, scene: int, frame: int, mirrored: bool, images: bool = True) -> LoadedFrame:
         """Read one frame; ``images=False`` returns an empty array in their place."""
-        source = self.scenes[scene]
+        source, calibration = self.scenes[scene], self._calibrations[scene][int(mirrored)]
         pixels = np.array(source.images[frame]) if images else np.zeros((0, 0, 0, 3), np.uint8)
-        if not mirrored or self._mirror_order is None:
-            return LoadedFrame(pixels, source.ego_to_global[frame], source.truths[frame])
-        pixels = mirror_images(pixels, self._mirror_order) if images else pixels
-        return LoadedFrame(pixels, mirror_pose(source.ego_to_global[frame]), mirror_truth(source.truths[frame]))
+        pose, truth = source.ego_to_global[frame], source.truths[frame]
+        if mirrored:
+            pixels, pose, truth = mirror_images(pixels), mirror_pose(pose), mirror_truth(truth)
+        return LoadedFrame(pixels, pose, calibration, truth)
 
 
 class SingleFrameBatches:
@@ -133,15 +143,16 @@ class SingleFrameBatches:
         drawn = generator.choice(len(self._scenes.frame_index), self._batch, p=self._scenes.frame_probability)
         frames, images, valid = [], [], []
         for scene, frame in self._scenes.frame_index[drawn]:
-            mirrored = self._scenes.can_mirror and generator.random() < self._augmentation.mirror
+            mirrored = bool(generator.random() < self._augmentation.mirror)
             loaded = self._scenes.load(scene, frame, mirrored)
             frames.append(loaded)
             images.append(change_light(loaded.images, self._augmentation, generator))
             valid.append(drop_camera(len(loaded.images), self._augmentation, generator))
         return Batch(
-            images=torch.from_numpy(np.stack(images)),
-            camera_valid=torch.from_numpy(np.stack(valid)),
+            images=pad_cameras(images),
+            camera_valid=pad_cameras(valid),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in frames])),
+            calibration=collate_calibrations([frame.calibration for frame in frames]),
             targets=truth_targets([frame.truth for frame in frames], self._roi, self._points, RASTER_GRID),
         )
 

@@ -1,10 +1,10 @@
-"""Fill the training cache: demo towns rendered straight at the network's size, or a data set's images, cropped."""
+"""Fill the training cache: demo towns, rendered straight at the network's size."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from hashlib import sha256
@@ -13,15 +13,14 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mapfusion.geometry import inverse_pose
 from predmapnet.config import ImageWindowConfig, LookupBevConfig, PredMapNetConfig
-from predmapnet.datasets.images import read_image
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import crop_image, image_window, window_intrinsics
-from predmapnet.scenes import Camera, Rig, Scene
-from predmapnet.training.data.scene_cache import write_scene
+from predmapnet.network.image_input import image_window, window_intrinsics
+from predmapnet.scenes import Camera, Rig
+from predmapnet.training.data.scene_cache import Images, write_cached_scene
+from predmapnet.training.settings import Report
 
 if TYPE_CHECKING:
     from predmapnet.demo_world.render.renderer import Renderer
@@ -36,8 +35,6 @@ TEXEL = 0.07
 """Metres of the ground's texture, finer than a pixel of the network sees it beyond 10 m."""
 SCALING_BLUR = 1.0
 """Standard deviation by which scaling photographs down blurs them, pixels of an image 800 wide."""
-
-Report = Callable[[str], None]
 
 
 def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
@@ -132,7 +129,7 @@ def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
         lidar_to_shifted = ego_to_shifted @ lidar_to_ego
         sweeps = (scan(renderer, frame, lidar_to_ego)[:, :3].astype(np.float64) for frame in range(len(poses)))
         lidar = [sweep @ lidar_to_shifted[:3, :3].T + lidar_to_shifted[:3, 3] for sweep in sweeps]
-    write_scene(folder, rig, images, shifted, truths, lidar)
+    write_cached_scene(folder, rig, images, shifted, truths, lidar)
 
 
 def _car_and_light(world: World, config: PredMapNetConfig) -> tuple[Rig, Response, Light]:
@@ -152,7 +149,7 @@ def _car_and_light(world: World, config: PredMapNetConfig) -> tuple[Rig, Respons
     return rig, replace(response, blur=float(np.hypot(response.blur, SCALING_BLUR))), light
 
 
-def _render(renderer: Renderer, cameras: Rig) -> NDArray[np.uint8]:
+def _render(renderer: Renderer, cameras: Rig) -> Images:
     """Draw all frames, ``(n, N, h, w, 3)``."""
     count = len(renderer.world.trajectory.timestamps)
     images = np.empty((count, len(cameras), cameras[0].height, cameras[0].width, 3), np.uint8)
@@ -176,34 +173,3 @@ def window_camera(camera: Camera, config: PredMapNetConfig) -> Camera:
         height=config.image.height,
         intrinsics=window_intrinsics(camera, config.image),
     )
-
-
-def cache_scene(folder: Path, scene: Scene, config: PredMapNetConfig) -> None:
-    """Read, scale and crop the images of one scene of any data set.
-
-    Frames that lack an image stay out: the cache has no place for missing cameras.
-
-    Raises:
-        UserError: an image is damaged, or the scene has no ground truth or lacks lidar from which depth is learned.
-    """
-    images: list[NDArray[np.uint8]] = []
-    poses, truths, sweeps = [], [], []
-    for index in range(len(scene)):
-        frame = scene.frame(index)
-        truth = scene.truth(index, config.roi)
-        if truth is None:
-            raise UserError(f"Scene {scene.info.name} has no ground truth to train on.")
-        if any(camera.name not in frame.images for camera in frame.rig):
-            continue
-        pictures = [crop_image(read_image(frame.images[c.name]), c, config.image) for c in frame.rig]
-        images.append(np.rint(pictures).astype(np.uint8))
-        poses.append(frame.ego_to_global)
-        truths.append(truth)
-        if config.depth.enabled:
-            sweep = scene.lidar(index)
-            if sweep is None:
-                raise UserError(f"Scene {scene.info.name}, frame {index}, has no lidar file to learn depth from.")
-            sweeps.append(sweep)
-    if not images:
-        raise UserError(f"Scene {scene.info.name} has no frame with all cameras.")
-    write_scene(folder, scene.rig, np.stack(images), np.stack(poses), truths, sweeps or None)

@@ -1,4 +1,4 @@
-"""The training cache: scenes as arrays that the network can eat, memory-mapped from disk.
+"""Training cache: scenes as arrays at the network's image size, memory-mapped from disk.
 
 One scene is one folder: ``images.npy`` after the network's preprocessing, ``frames.npz`` with poses and truth,
 ``rig.json``, and ``lidar.npy`` with all sweeps one after the other where a network learns depth. A folder appears
@@ -22,7 +22,7 @@ from predmapnet.scenes import Camera, FrameTruth, Rig
 Float = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-LIDAR = "lidar.npy"
+LIDAR_FILE = "lidar.npy"
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class CachedScene:
         return len(self.images)
 
 
-def write_scene(
+def write_cached_scene(
     folder: Path,
     rig: Rig,
     images: Images,
@@ -83,7 +83,7 @@ def write_scene(
         sweeps=np.array([len(sweep) for sweep in lidar or ()], dtype=np.int64),
     )
     if lidar is not None:
-        np.save(partial / LIDAR, np.concatenate(lidar).astype(np.float32))
+        np.save(partial / LIDAR_FILE, np.concatenate(lidar).astype(np.float32))
     (partial / "rig.json").write_bytes(
         orjson.dumps([asdict(camera) for camera in rig], option=orjson.OPT_SERIALIZE_NUMPY)
     )
@@ -91,17 +91,17 @@ def write_scene(
     partial.rename(folder)
 
 
-def read_scene(folder: Path) -> CachedScene:
+def read_cached_scene(folder: Path) -> CachedScene:
     """Open one scene of the cache; images stay on disk until they are used.
 
     Raises:
-        UserError: the folder does not hold what :func:`write_scene` writes.
+        UserError: the folder does not hold what :func:`write_cached_scene` writes.
     """
     try:
         images = np.load(folder / "images.npy", mmap_mode="r")
         with np.load(folder / "frames.npz") as stored:
             arrays = {name: stored[name] for name in stored.files}
-        sweeps = np.load(folder / LIDAR, mmap_mode="r") if (folder / LIDAR).exists() else None
+        sweeps = np.load(folder / LIDAR_FILE, mmap_mode="r") if (folder / LIDAR_FILE).exists() else None
         rig = tuple(_camera(entry) for entry in orjson.loads((folder / "rig.json").read_bytes()))
     except (OSError, ValueError, KeyError) as error:
         raise UserError(f"{folder} of the training cache is damaged ({error}). Delete it and train again.") from None
@@ -118,19 +118,3 @@ def read_scene(folder: Path) -> CachedScene:
 def _camera(entry: dict[str, object]) -> Camera:
     matrices = {name: np.array(entry[name], dtype=np.float64) for name in ("intrinsics", "camera_to_ego")}
     return Camera(**{**entry, **matrices})  # type: ignore[arg-type]
-
-
-def same_rig(first: Rig, second: Rig, tolerance: float = 0.03) -> bool:
-    """Whether two rigs are the same cameras in the same places.
-
-    Args:
-        first, second: rigs.
-        tolerance: largest difference of poses, metres (small enough for the pitch of the car between two instants);
-            focal lengths may differ by that part of ten pixels.
-    """
-    return len(first) == len(second) and all(
-        (one.name, one.width, one.height) == (other.name, other.width, other.height)
-        and np.allclose(one.intrinsics, other.intrinsics, rtol=0.0, atol=10 * tolerance)
-        and np.allclose(one.camera_to_ego, other.camera_to_ego, rtol=0.0, atol=tolerance)
-        for one, other in zip(first, second, strict=True)
-    )

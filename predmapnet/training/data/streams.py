@@ -1,4 +1,4 @@
-"""The temporal stage's data: streams of consecutive frames that go on from optimiser step to optimiser step."""
+"""Streams of the temporal stage: consecutive frames that go on from optimiser step to optimiser step."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mapfusion.elements import RegionOfInterest
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.batches import RASTER_GRID, Batch, LoadedFrame, TrainingScenes
 from predmapnet.training.data.targets import Targets, truth_targets
 from predmapnet.training.settings import StreamSettings
 
-NOTHING = FrameTruth(np.zeros(0, np.int64), (), np.zeros(0, np.int64))
+NO_TRUTH = FrameTruth(np.zeros(0, np.int64), (), np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class StreamPlan:
 
 
 @dataclass
-class Clip:
+class StreamSegment:
     """A few consecutive frames of every stream.
 
     Attributes:
@@ -64,9 +65,9 @@ class Clip:
     after: Targets
     plan: StreamPlan
 
-    def to(self, device: torch.device) -> Clip:
+    def to(self, device: torch.device) -> StreamSegment:
         """Move every tensor to ``device``."""
-        return Clip(
+        return StreamSegment(
             instants=[instant.to(device) for instant in self.instants],
             features=[BevFeatures([level.to(device) for level in one.levels]) for one in self.features],
             fresh=self.fresh.to(device),
@@ -128,7 +129,7 @@ class FeatureStore:
         return self._folder / f"{scene:05d}.npy"
 
 
-class StreamClips:
+class StreamSegments:
     """Draws clips and cuts them into steps. Must be called step after step, since streams go on."""
 
     def __init__(
@@ -148,19 +149,19 @@ class StreamClips:
         self._seed = seed
         self.plan = StreamPlan.start(settings.streams)
 
-    def __call__(self, step: int) -> Clip:
+    def __call__(self, step: int) -> StreamSegment:
         """Return the next frames of all streams."""
         plan, fresh = self._renewed(step)
         count = self._settings.frames
         instants = [self._instant(plan, offset) for offset in range(count)]
         features = [self._store.read(plan.scene, plan.frame + offset) for offset in range(count)]
         following = [
-            self._load(int(scene), int(frame) + count).truth if frame + count < end else NOTHING
+            self._load(int(scene), int(frame) + count).truth if frame + count < end else NO_TRUTH
             for scene, frame, end in zip(plan.scene, plan.frame, plan.end, strict=True)
         ]
         self.plan = StreamPlan(plan.scene, plan.frame + count, plan.end)
         after = truth_targets(following, self._roi, self._points, None)
-        return Clip(instants, features, torch.from_numpy(fresh), after, self.plan)
+        return StreamSegment(instants, features, torch.from_numpy(fresh), after, self.plan)
 
     def _renewed(self, step: int) -> tuple[StreamPlan, NDArray[np.bool_]]:
         """Begin new clips where the old ones are over."""
@@ -179,11 +180,11 @@ class StreamClips:
 
     def _instant(self, plan: StreamPlan, offset: int) -> Batch:
         loaded = [self._load(int(s), int(f) + offset) for s, f in zip(plan.scene, plan.frame, strict=True)]
-        cameras = len(self._scenes.scenes[0].rig)
         return Batch(
             images=torch.zeros((len(loaded), 0, 0, 0, 3), dtype=torch.uint8),
-            camera_valid=torch.ones((len(loaded), cameras), dtype=torch.bool),
+            camera_valid=torch.ones((len(loaded), 0), dtype=torch.bool),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            calibration=Calibration.empty(len(loaded)),
             targets=truth_targets([frame.truth for frame in loaded], self._roi, self._points, RASTER_GRID),
         )
 

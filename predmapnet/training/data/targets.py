@@ -1,4 +1,4 @@
-"""Ground truth as the losses want it: resampled polylines, their equivalent orders, and rasters on the BEV grid."""
+"""Targets of the losses: resampled true polylines, their equivalent orders, and rasters on the BEV grid."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from predmapnet.training.losses.matching import (
     Assignment,
     MatchingCosts,
     best_order,
-    join,
+    joined_pairs,
     match,
 )
 
@@ -195,11 +195,11 @@ def frame_losses(
         if layer.logits is not None:
             resized = targets if masks is None else Targets(**{**vars(targets), "masks": masks})
             assignment = match(
-                layer.logits, layer.points, layer.masks, outputs.row_valid, track_rows, resized, size, costs
+                layer.logits, layer.points, layer.masks, outputs.query_valid, track_rows, resized, size, costs
             )
             if tracks is not None:
-                assignment = join(tracks, assignment)
-        for name, term in _layer_terms(layer, outputs.row_valid, targets, masks, assignment, size, weights).items():
+                assignment = joined_pairs(tracks, assignment)
+        for name, term in _layer_terms(layer, outputs.query_valid, targets, masks, assignment, size, weights).items():
             terms[name] = terms[name] + term if name in terms else term
     segmentation = functional.adaptive_max_pool2d(targets.segmentation, outputs.segmentation.shape[-2:])
     cells = outputs.segmentation
@@ -218,7 +218,7 @@ def masks_of_size(masks: Tensor, like: Tensor) -> Tensor:
 
 def _layer_terms(
     layer: LayerPredictions,
-    row_valid: Tensor,
+    query_valid: Tensor,
     targets: Targets,
     masks: Tensor | None,
     pairs: Assignment,
@@ -232,7 +232,7 @@ def _layer_terms(
     if layer.logits is not None:
         wanted = torch.zeros_like(layer.logits)
         wanted[pairs.frame, pairs.row, kinds] = 1.0
-        terms["focal"] = weights.focal / positives * focal_loss(layer.logits[row_valid], wanted[row_valid]).sum()
+        terms["focal"] = weights.focal / positives * focal_loss(layer.logits[query_valid], wanted[query_valid]).sum()
     if layer.points is not None:
         points = layer.points[pairs.frame, pairs.row] * size
         rings = kinds == ElementKind.PED_CROSSING

@@ -15,7 +15,7 @@ from predmapnet.network.ego_motion import invert_pose, move_points, plane_motion
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
 from predmapnet.training.data.targets import equivalent_orders
 from predmapnet.training.losses.lite import focal_loss
-from predmapnet.training.losses.matching import FOCAL_ALPHA, FOCAL_GAMMA
+from predmapnet.training.losses.matching import focal_class_cost
 
 CLASS_WEIGHT, LINE_WEIGHT, SEGMENTATION_WEIGHT = 5.0, 50.0, 100.0
 """The official configuration asks for 10 in the segmentation, and the code applies it twice."""
@@ -59,19 +59,6 @@ def all_orders(points: Tensor, kinds: Tensor) -> Tensor:
     return torch.where(is_ring[:, None, None], points[:, ring].flatten(2), lines)
 
 
-def class_cost(logits: Tensor, kinds: Tensor) -> Tensor:
-    """Focal loss of each row being each piece of truth, less that of not being it: ``(R, G)``.
-
-    Args:
-        logits: ``(R, classes)``.
-        kinds: ``(G) int64``.
-    """
-    probability = logits.sigmoid()
-    positive = -FOCAL_ALPHA * (1 - probability) ** FOCAL_GAMMA * (probability + 1e-12).log()
-    negative = -(1 - FOCAL_ALPHA) * probability**FOCAL_GAMMA * (1 - probability + 1e-12).log()
-    return (positive - negative)[:, kinds]
-
-
 def line_cost(lines: Tensor, orders: Tensor) -> tuple[Tensor, Tensor]:
     """Smooth L1 distance, summed over a line's numbers and divided by its points, under the best order of the truth.
 
@@ -90,7 +77,7 @@ def line_cost(lines: Tensor, orders: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def assign(
+def assign_layer(
     logits: Tensor, lines: Tensor, orders: Tensor, kinds: Tensor, detection: Tensor, continued: Tensor
 ) -> LayerTargets:
     """Decide which row answers for which piece of truth.
@@ -106,7 +93,7 @@ def assign(
         continued: ``(R) int64``, the truth that a track goes on with; -1 for all other rows.
     """
     distance, order = line_cost(lines, orders)
-    cost = CLASS_WEIGHT * class_cost(logits, kinds) + LINE_WEIGHT * distance
+    cost = CLASS_WEIGHT * focal_class_cost(logits)[:, kinds] + LINE_WEIGHT * distance
     cost = cost.masked_fill(~detection[:, None], torch.inf)
     tracks = torch.nonzero(continued >= 0)[:, 0]
     cost[:, continued[tracks]] = torch.inf

@@ -1,4 +1,4 @@
-"""Which prediction answers for which truth: Hungarian assignment over every equivalent order of the points."""
+"""Assignment of predictions to truth: Hungarian, over every equivalent order of the points."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Assignment:
         return len(self.row)
 
 
-def join(first: Assignment, second: Assignment) -> Assignment:
+def joined_pairs(first: Assignment, second: Assignment) -> Assignment:
     """Return all pairs of both."""
     return Assignment(
         torch.cat([first.frame, second.frame]),
@@ -144,7 +144,7 @@ def match(
     logits: Tensor,
     points: Tensor | None,
     masks: Tensor | None,
-    row_valid: Tensor,
+    query_valid: Tensor,
     first_row: int,
     targets: Targets,
     size: Tensor,
@@ -156,7 +156,7 @@ def match(
         logits: ``(B, rows, 3)``.
         points: ``(B, rows, P, 2)``, normalised, or None for a layer that has masks only.
         masks: ``(B, rows, H, W)`` logits; needed only without points, then of the size of ``targets.masks``.
-        row_valid: ``(B, rows) bool``; invalid rows are never chosen.
+        query_valid: ``(B, rows) bool``; invalid rows are never chosen.
         first_row: rows before it stay out.
         targets: the truth of the ``B`` frames.
         size: ``(2,)``, length and width of the ROI, metres.
@@ -166,7 +166,7 @@ def match(
     pairs: list[Tensor] = []
     for frame in range(targets.batch):
         truth = torch.nonzero(targets.frame == frame)[:, 0]
-        rows = first_row + torch.nonzero(row_valid[frame, first_row:])[:, 0]
+        rows = first_row + torch.nonzero(query_valid[frame, first_row:])[:, 0]
         if not len(truth) or not len(rows):
             continue
         kinds = targets.kinds[truth]

@@ -1,14 +1,14 @@
 """A network small enough for tests, and streams of random frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.small.ground_lookup import RigLookup
 from predmapnet.network.state import FrameInputs
 
 SMALL = {
@@ -20,6 +20,15 @@ SMALL = {
     "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
     "future": {"hidden": 32},
 }
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Tiny tensors are not worth a second thread, and wait for it long where the cores are busy."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture
@@ -40,11 +49,6 @@ def network(make_network: Callable[..., PredMapNet]) -> PredMapNet:
 
 
 @pytest.fixture
-def lookup(network: PredMapNet) -> RigLookup:
-    return network.make_rig_lookup(DEMO_RIG)
-
-
-@pytest.fixture
 def make_inputs(network: PredMapNet) -> Callable[..., FrameInputs]:
     """Return a maker of random frames; ``x`` moves the car forward, metres."""
 
@@ -57,6 +61,7 @@ def make_inputs(network: PredMapNet) -> Callable[..., FrameInputs]:
             images=torch.randn(batch, len(DEMO_RIG), 3, image.height, image.width, generator=generator),
             camera_valid=torch.ones(batch, len(DEMO_RIG), dtype=torch.bool),
             ego_to_global=pose,
+            calibration=collate_calibrations([calibrate(DEMO_RIG, network.config)] * batch),
         )
 
     return make

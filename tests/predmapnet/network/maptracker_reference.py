@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PredMapNetConfig
-from predmapnet.network.maptracker.camera_pillars import CameraPillars, make_camera_pillars
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
 from predmapnet.weights.maptracker_import import import_maptracker
@@ -84,10 +83,18 @@ class Reference:
             images=images,
             camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
             ego_to_global=pose(rotations[frame], translations[frame])[None],
+            calibration=self.calibration(size),
         )
 
-    def pillars(self, size: tuple[int, int], config: PredMapNetConfig) -> CameraPillars:
-        return make_camera_pillars(torch.from_numpy(self.spec.ego2img(*size)), size, config.bev, config.roi)
+    def calibration(self, size: tuple[int, int]) -> Calibration:
+        ego_to_image = torch.from_numpy(self.spec.ego2img(*size))[None, :, :3]
+        cameras = ego_to_image.shape[1]
+        return Calibration(
+            ego_to_image=ego_to_image,
+            image_size=torch.tensor(size[::-1], dtype=torch.float64).expand(1, cameras, 2),
+            ground_height=torch.zeros(1, cameras, dtype=torch.float64),
+            camera_code=torch.arange(cameras)[None],
+        )
 
 
 @cache

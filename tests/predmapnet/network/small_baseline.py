@@ -2,10 +2,9 @@
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.maptracker.camera_pillars import CameraPillars, make_camera_pillars
+from predmapnet.network.calibration import Calibration, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
@@ -57,16 +56,17 @@ def small_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
     return network
 
 
-def two_cameras() -> Tensor:
+def two_cameras() -> Calibration:
     """One camera looks forward, one back, 1.5 m above the ground."""
     intrinsics = np.array([[60.0, 0, 48, 0], [0, 60.0, 32, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     forward = np.array([[0.0, -1, 0, 0], [0, 0, -1, 1.5], [1, 0, 0, 0], [0, 0, 0, 1]])
     backward = np.array([[0.0, 1, 0, 0], [0, 0, -1, 1.5], [-1, 0, 0, 0], [0, 0, 0, 1]])
-    return torch.from_numpy(np.stack([intrinsics @ forward, intrinsics @ backward]))
-
-
-def small_pillars(config: PredMapNetConfig) -> CameraPillars:
-    return make_camera_pillars(two_cameras(), SIZE, config.bev, config.roi)
+    return Calibration(
+        ego_to_image=torch.from_numpy(np.stack([intrinsics @ forward, intrinsics @ backward])[None, :, :3]),
+        image_size=torch.tensor(SIZE[::-1], dtype=torch.float64).expand(1, 2, 2),
+        ground_height=torch.zeros(1, 2, dtype=torch.float64),
+        camera_code=torch.tensor([[0, 1]]),
+    )
 
 
 def frames(count: int, seed: int, step: float = 1.7) -> list[FrameInputs]:
@@ -77,16 +77,20 @@ def frames(count: int, seed: int, step: float = 1.7) -> list[FrameInputs]:
         pose = torch.eye(4, dtype=torch.float64)[None]
         pose[0, :2, 3] = torch.tensor([1000.0 + step * number, -500.0 + seed], dtype=torch.float64)
         images = 30 * torch.randn(1, 2, 3, *SIZE, generator=generator)
-        inputs.append(FrameInputs(images, torch.ones(1, 2, dtype=torch.bool), pose))
+        inputs.append(FrameInputs(images, torch.ones(1, 2, dtype=torch.bool), pose, two_cameras()))
     return inputs
 
 
 def together(streams: list[FrameInputs]) -> FrameInputs:
-    return FrameInputs(*(torch.cat([getattr(one, name) for one in streams]) for name in vars(streams[0])))
+    """Put frames of several streams into one batch."""
+    tensors = {
+        name: torch.cat([getattr(one, name) for one in streams]) for name in vars(streams[0]) if name != "calibration"
+    }
+    return FrameInputs(**tensors, calibration=collate_calibrations([one.calibration for one in streams]))
 
 
 def step(network, inputs, state):
     """One frame of a stream: outputs, and the state after it."""
-    outputs = network(inputs, small_pillars(network.config), state)
+    outputs = network(inputs, state)
     selection = select(outputs, state, network.config)
     return outputs, network.advance(state, outputs, selection.instances, inputs)

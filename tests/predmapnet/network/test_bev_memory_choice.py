@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from predmapnet.network.small.bev_memory import remember_bev
+from predmapnet.network.small.residual_bev_memory import store_raw_map
 
 SPACING = 2.0
 
@@ -20,7 +20,7 @@ def drive(network, positions):
     state = network.initial_state(1)
     for x in positions:
         raw = torch.full((1, 4, 26, 52), float(x))
-        maps, poses, valid = remember_bev(state, raw, pose_at(x), SPACING)
+        maps, poses, valid = store_raw_map(state, raw, pose_at(x), SPACING)
         state = replace(state, bev_memory=maps, bev_memory_pose=poses, bev_memory_valid=valid)
     return state
 
@@ -52,7 +52,7 @@ def test_what_is_looked_at_has_been_moved_with_the_car(network):
     raw = torch.zeros(1, 4, 26, 52)
     raw[:, :, 12, 30] = 1.0
     cell = 60.0 / 52
-    maps, poses, valid = remember_bev(state, raw, pose_at(0.0), SPACING)
+    maps, poses, valid = store_raw_map(state, raw, pose_at(0.0), SPACING)
     state = replace(state, bev_memory=maps, bev_memory_pose=poses, bev_memory_valid=valid)
     past, reached = network.temporal_bev._look_back(pose_at(2 * cell), state)
     assert past[0, 0].argmax() == 12 * 52 + 28

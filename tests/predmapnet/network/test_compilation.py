@@ -19,12 +19,12 @@ from tests.predmapnet.network.test_low_precision import case
 def test_compiled_agrees(name):
     if shutil.which(os.environ.get("CXX", "g++")) is None:
         pytest.skip("there is no C++ compiler")
-    network, lookup, inputs = case(name)
+    network, inputs = case(name)
     plain, compiled = for_inference(network), for_inference(network)
     compile_features(compiled)
     state = plain.initial_state(1)
     for frame in inputs:
-        expected, outputs = plain(frame, lookup, state), compiled(frame, lookup, state)
+        expected, outputs = plain(frame, state), compiled(frame, state)
         for ours, theirs in zip(outputs.layers[-2:], expected.layers[-2:], strict=True):
             torch.testing.assert_close(ours.points, theirs.points, rtol=0, atol=1e-4)
             torch.testing.assert_close(ours.logits, theirs.logits, rtol=0, atol=1e-4)

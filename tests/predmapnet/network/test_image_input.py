@@ -19,6 +19,7 @@ from predmapnet.datasets.argoverse2 import GROUND_HEIGHT, Argoverse2Source
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import (
     crop_image,
     ego_to_image,
@@ -27,8 +28,8 @@ from predmapnet.network.image_input import (
     normalise_images,
     stack_windows,
 )
-from predmapnet.network.maptracker.camera_pillars import project_pillars
-from predmapnet.network.small.ground_lookup import make_rig_lookup
+from predmapnet.network.maptracker.reference_points import pillar_points, project_pillars
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.scenes import Camera
 from tests.predmapnet.network.maptracker_reference import FOLDER
@@ -148,8 +149,9 @@ def test_projections_of_the_real_car_are_the_official_ones():
     np.testing.assert_allclose(ours, official, atol=1e-9)
 
     config = preset("maptracker-nuscenes")
-    positions, hits = project_pillars(torch.from_numpy(ours), input_size(WHOLE), config.bev, config.roi)
-    expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), config.bev, config.roi)
+    pillars = pillar_points(config.bev, config.roi)
+    positions, hits = project_pillars(torch.from_numpy(ours), input_size(WHOLE), pillars)
+    expected, expected_hits = project_pillars(torch.from_numpy(official), input_size(WHOLE), pillars)
     assert torch.equal(hits, expected_hits)
     torch.testing.assert_close(positions[hits], expected[hits], rtol=0, atol=1e-6)
 
@@ -173,7 +175,7 @@ def test_the_road_ahead_stands_in_the_upright_front_camera_of_argoverse():
         assert u / depth == pytest.approx(known["cx_px"] * 608 / 1550, abs=6)
         assert v / depth == pytest.approx((known["cy_px"] + known["fy_px"] * below / depth) * 608 / 2048, abs=6)
     config = preset("paper-av2")
-    _, hits = project_pillars(torch.from_numpy(matrices), input_size(ARGOVERSE), config.bev, config.roi)
+    _, hits = project_pillars(torch.from_numpy(matrices), input_size(ARGOVERSE), pillar_points(config.bev, config.roi))
     seen = hits.any(dim=-1)
     assert (seen.float().mean(dim=1) > 0.05).all() and seen.any(dim=0).float().mean() > 0.95
 
@@ -198,11 +200,12 @@ def test_a_rig_whose_origin_lies_above_the_road_sees_the_same_road():
     raised = tuple(replace(one, camera_to_ego=one.camera_to_ego.copy(), ground_height=-0.4) for one in DEMO_RIG)
     for one in raised:
         one.camera_to_ego[2, 3] -= 0.4
-    lookup, expected = make_rig_lookup(raised, config), make_rig_lookup(DEMO_RIG, config)
+    find = PredMapNet(config).view_geometry
+    lookup, expected = find(calibrate(raised, config)), find(calibrate(DEMO_RIG, config))
     assert torch.equal(lookup.visible, expected.visible)
     assert torch.equal(lookup.gather.columns, expected.gather.columns)
     torch.testing.assert_close(lookup.gather.weights, expected.gather.weights)
-    forgotten = make_rig_lookup(tuple(replace(one, ground_height=0.0) for one in raised), config)
+    forgotten = find(calibrate(tuple(replace(one, ground_height=0.0) for one in raised), config))
     assert not torch.equal(forgotten.visible, expected.visible)
 
 

@@ -6,45 +6,46 @@ import torch
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.machine import Precision
+from predmapnet.network.calibration import calibrate
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
 from tests.predmapnet.network.conftest import SMALL
-from tests.predmapnet.network.small_baseline import frames, small_config, small_network, small_pillars
+from tests.predmapnet.network.small_baseline import frames, small_config, small_network
 
 FRAMES = 3
 
 
-def lite_frames():
+def lite_frames(config):
     generator = torch.Generator().manual_seed(0)
     for number in range(FRAMES):
         pose = torch.eye(4, dtype=torch.float64)[None].clone()
         pose[0, 0, 3] = 2.0 * number
         images = torch.randn(1, 6, 3, 24, 64, generator=generator)
-        yield FrameInputs(images, torch.ones(1, 6, dtype=torch.bool), pose)
+        yield FrameInputs(images, torch.ones(1, 6, dtype=torch.bool), pose, calibrate(DEMO_RIG, config))
 
 
 def case(name):
-    """A network, its look-up and frames for it."""
+    """A network and frames for it."""
     if name == "lite":
         network = small_network(PredMapNetConfig.model_validate(SMALL))
         for parameter in (value for key, value in network.named_parameters() if key.endswith("classify.bias")):
             torch.nn.init.constant_(parameter, 0.5)  # So that there are tracks.
-        return network, network.make_rig_lookup(DEMO_RIG), list(lite_frames())
+        return network, list(lite_frames(network.config))
     network = small_network(small_config(name))
-    return network, small_pillars(network.config), frames(FRAMES, seed=0)
+    return network, frames(FRAMES, seed=0)
 
 
 @pytest.mark.parametrize("name", ["lite", "maptracker-nuscenes", "paper-nuscenes"])
 @torch.inference_mode()
 def test_bfloat16_agrees_with_float32(name):
-    network, lookup, inputs = case(name)
+    network, inputs = case(name)
     exact = in_precision(for_inference(network), Precision.FLOAT32)
     low = in_precision(for_inference(network), Precision.BFLOAT16)
     state = exact.initial_state(1)
     for frame in inputs:
-        expected, outputs = exact(frame, lookup, state), low(frame, lookup, state)
+        expected, outputs = exact(frame, state), low(frame, state)
         difference = (outputs.segmentation - expected.segmentation).abs().max()
         assert 0 < difference < 0.03 * expected.segmentation.abs().max()
         assert (outputs.layers[-1].points - expected.layers[-1].points).abs().max() < 0.005
@@ -58,7 +59,7 @@ def test_bfloat16_agrees_with_float32(name):
 
 
 def test_layers_that_say_where_to_look_stay_exact():
-    network, _, _ = case("paper-nuscenes")
+    network, _ = case("paper-nuscenes")
     low = in_precision(for_inference(network), Precision.BFLOAT16)
     kinds = {name: parameter.dtype for name, parameter in low.named_parameters()}
     exact = [name for name in kinds if "offsets" in name or "attention_weights" in name or "norms" in name]

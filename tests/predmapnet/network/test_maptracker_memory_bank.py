@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from predmapnet.network.maptracker.motion_mlp import MotionMlp
-from predmapnet.network.maptracker.vector_memory import empty_vector_memory, recall, remember
+from predmapnet.network.maptracker.vector_memory import empty_vector_memory, recall_queries, store_queries
 from predmapnet.presets import preset
 from tests.predmapnet.network.maptracker_reference import FOLDER, difference, load_reference, pose
 
@@ -49,7 +49,7 @@ def test_entries_are_kept_chosen_and_carried_as_officially(expected, motion):
             name.removeprefix(f"t{step}/"): value for name, value in expected.items() if name.startswith(f"t{step}/")
         }
         if step > 0:
-            recalled = recall(memory, motion, now, frame, config.decoder.memory_distances)
+            recalled = recall_queries(memory, motion, now, frame, config.decoder.memory_distances)
             entries = memory.valid[0].sum(dim=-1)
             first = memory.valid.shape[-1] - entries
             chosen = (recalled.slots[0] - first[:, None])[entries > recalled.slots.shape[-1]]
@@ -64,7 +64,7 @@ def test_entries_are_kept_chosen_and_carried_as_officially(expected, motion):
         matched = torch.tensor([[*(True for _ in kept), *(False for _ in born)]])
         ids = [ids[index] for index in kept] + list(range(born_ever, born_ever + len(born)))
         born_ever += len(born)
-        memory = remember(memory, queries[rows][None], source, matched, now, frame, torch.ones_like(matched))
+        memory = store_queries(memory, queries[rows][None], source, matched, now, frame, torch.ones_like(matched))
         assert ids == values["active_ids_after"].tolist()
         lengths = np.minimum(values["entry_lengths_after"], config.decoder.memory_capacity)
         assert memory.valid[0].sum(dim=-1).tolist() == lengths.tolist(), step

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from predmapnet.network.maptracker.bev_memory import BevHistory, look_back
-from predmapnet.network.maptracker.camera_pillars import CameraPillars, project_pillars
-from predmapnet.network.maptracker.vector_memory import age_code, recall
+from predmapnet.network.maptracker.bev_memory import PastBevMaps, warp_past_maps
+from predmapnet.network.maptracker.reference_points import ReferencePoints, project_pillars
+from predmapnet.network.maptracker.vector_memory import age_code, recall_queries
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs, FrameOutputs, Selection, StreamState
 from predmapnet.network.track_selection import select
@@ -78,15 +78,15 @@ def run(request) -> Run:
         pytest.skip(f"no reference fixtures in {FOLDER}: set PREDMAPNET_REFERENCE")
     reference, size = load_reference(), request.param
     network, frames = reference.network, reference.frames(size)
-    pillars = reference.pillars(size, network.config)
+    references = network.view_geometry(reference.calibration(size), size)
     state, result = network.initial_state(1), Run()
     with torch.no_grad():
         for frame in range(frames):
             inputs, expected = reference.inputs(size, frame, frames), reference.expected(size, frame)
             with recorded(dict(network.named_modules())) as calls:
-                outputs = network(inputs, pillars, state)
+                outputs = network(inputs, state, references)
             selection = select(outputs, state, network.config)
-            step = Step(reference, network, inputs, pillars, state, calls, outputs, selection)
+            step = Step(reference, network, inputs, references, state, calls, outputs, selection)
             state = network.advance(state, outputs, selection.instances, inputs)
             found = step.fixtures(size, state)
             result.differences.append({})
@@ -109,7 +109,7 @@ class Step:
     reference: Reference
     network: PredMapNet
     inputs: FrameInputs
-    pillars: CameraPillars
+    references: ReferencePoints
     state: StreamState
     calls: dict[str, list[tuple[tuple[Tensor, ...], Tensor]]]
     outputs: FrameOutputs
@@ -120,7 +120,7 @@ class Step:
 
     def fixtures(self, size: tuple[int, int], after: StreamState) -> dict[str, Tensor]:
         """Everything under the name of its fixture."""
-        history = look_back(self.state, self.inputs.ego_to_global, self.network.config)
+        history = warp_past_maps(self.state, self.inputs.ego_to_global, self.network.config)
         return (
             self.image_features()
             | self.projections(size)
@@ -140,19 +140,19 @@ class Step:
         return named | {f"fpn_level{level}": self.out(f"image_backbone.pyramid.smooth.{level}") for level in range(3)}
 
     def projections(self, size: tuple[int, int]) -> dict[str, Tensor]:
-        ego_to_image = torch.from_numpy(self.reference.spec.ego2img(*size))
-        positions, inside = project_pillars(ego_to_image, size, self.network.config.bev, self.network.config.roi)
+        ego_to_image = self.inputs.calibration.ego_to_image[0]
+        positions, inside = project_pillars(ego_to_image, size, self.network.bev_encoder.pillars)
         return {
             "sca_ref_cam": positions.where(inside[..., None], 0.0)[:, None],
             "sca_bev_mask": inside[:, None],
-            "sca_hit_queries_per_cam": self.pillars.camera.bincount(minlength=len(ego_to_image)),
+            "sca_hit_queries_per_cam": self.references.camera.bincount(minlength=len(ego_to_image)),
         }
 
     def tokens(self) -> Tensor:
         levels = [self.out(f"image_backbone.pyramid.smooth.{level}")[None] for level in range(3)]
-        return self.network.bev_encoder.image_tokens(levels)
+        return self.network.bev_encoder.image_tokens(levels, self.inputs.calibration.camera_code)
 
-    def encoder(self, history: BevHistory) -> dict[str, Tensor]:
+    def encoder(self, history: PastBevMaps) -> dict[str, Tensor]:
         bev, encoder = self.outputs.bev, self.network.bev_encoder
         missing = bev.new_zeros(1, 4 - history.maps.shape[1], *bev.shape[1:])
         named = {
@@ -176,10 +176,10 @@ class Step:
         """Compare what cameras show to the cells that they see; the fixture holds meaningless rows as padding."""
         layer = int(name[3])
         attention = self.network.bev_encoder.layers[layer].image_attention
-        seen = attention.look(self.out(f"bev_encoder.layers.{layer}.norms.0"), self.tokens(), self.pillars)[0]
+        seen = attention.look(self.out(f"bev_encoder.layers.{layer}.norms.0"), self.tokens(), self.references)
         shape = expected[f"{name}|shape"]
         padded = torch.full(tuple(shape), torch.nan)
-        hits = self.pillars.camera.bincount(minlength=shape[0])
+        hits = self.references.camera.bincount(minlength=shape[0])
         padded[torch.arange(shape[1]) < hits[:, None]] = seen
         places = np.arange(len(expected[f"{name}|sample"])) * padded.numel() // len(expected[f"{name}|sample"])
         errors = np.abs(padded.flatten().numpy()[places] - expected[f"{name}|sample"])
@@ -225,7 +225,7 @@ class Step:
         config, pose = self.network.config, self.inputs.ego_to_global
         distances = config.decoder.memory_distances
         motion, frame = self.network.propagation.motion, self.state.frame
-        recalled = recall(self.state.vector_memory, motion, pose, frame, distances)
+        recalled = recall_queries(self.state.vector_memory, motion, pose, frame, distances)
         entries = self.state.vector_memory.valid[0].sum(dim=-1)
         long = entries > recalled.slots.shape[-1]
         first = self.state.vector_memory.valid.shape[-1] - entries

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from predmapnet.config import ALL_QUIRKS, MapTrackerQuirks
 from predmapnet.network.ego_motion import invert_pose, quaternion
-from predmapnet.network.history_choice import choose_history
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 from predmapnet.network.maptracker.bev_memory import warp_grid
+from predmapnet.network.maptracker.strided_selection import select_strided
 from tests.predmapnet.network.small_baseline import (
     frames,
     small_config,
@@ -130,7 +130,7 @@ def plain_choice(travelled: list[float], fallback: str) -> list[int]:
 def test_history_is_chosen_as_the_plain_rule_says(travelled, unused, fallback):
     distances = torch.tensor([[0.0] * unused + travelled])
     valid = torch.tensor([[False] * unused + [True] * len(travelled)])
-    slots, chosen = choose_history(distances, valid, (1.0, 5.0, 10.0, 15.0), fallback)
+    slots, chosen = select_strided(distances, valid, (1.0, 5.0, 10.0, 15.0), fallback)
     assert (slots[0][chosen[0]] - unused).tolist() == plain_choice(distances[0, unused:].tolist(), fallback)
     assert slots.shape[1] == min(4, len(travelled) + unused)
 

@@ -7,21 +7,21 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures
 from predmapnet.network.track_selection import select
 from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import clip_frame
 from predmapnet.training.data.batches import Batch
-from predmapnet.training.data.streams import Clip, StreamPlan
+from predmapnet.training.data.streams import StreamPlan, StreamSegment
 from predmapnet.training.data.targets import Targets
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
-from predmapnet.training.settings import StreamSettings, TrainingSettings
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import CLIP_STAGES, ClipSettings, StreamSettings, TrainingSettings
 from predmapnet.training.temporal import TemporalStage
-from predmapnet.training.workers import Workers
 from tests.predmapnet.network.conftest import SMALL
-from tests.predmapnet.network.small_baseline import SIZE, small_config, small_pillars
+from tests.predmapnet.network.small_baseline import SIZE, small_config, two_cameras
 from tests.predmapnet.pretended_gpu import pretended_gpu
 
 STREAMS, FRAMES = 2, 3
@@ -37,9 +37,9 @@ def network_of(config):
     return network
 
 
-def lookup_of(network):
-    is_lite = network.config.bev.kind == "lookup"
-    return network.make_rig_lookup(DEMO_RIG) if is_lite else small_pillars(network.config)
+def cameras_of(config):
+    is_lite = config.bev.kind == "lookup"
+    return collate_calibrations([calibrate(DEMO_RIG, config) if is_lite else two_cameras()] * STREAMS)
 
 
 def instant(config, number, size, cameras):
@@ -54,6 +54,7 @@ def instant(config, number, size, cameras):
         images=torch.randint(0, 255, (STREAMS, cameras, *size, 3), dtype=torch.uint8, generator=generator),
         camera_valid=torch.ones(STREAMS, cameras, dtype=torch.bool),
         ego_to_global=poses,
+        calibration=cameras_of(config),
         targets=Targets(
             batch=STREAMS,
             frame=torch.arange(STREAMS).repeat_interleave(3),
@@ -87,13 +88,13 @@ def test_a_stream_stays_on_the_gpu(name):
     config = PredMapNetConfig.model_validate(SMALL) if is_lite else small_config(name)
     size, cameras = ((24, 64), 6) if is_lite else (SIZE, 2)
     network = network_of(config).eval()
-    lookup, frames = lookup_of(network), [instant(config, number, size, cameras) for number in range(FRAMES)]
+    frames = [instant(config, number, size, cameras) for number in range(FRAMES)]
     with pretended_gpu() as gpu, torch.no_grad():
         gpu.put_network(network)
-        lookup, state = gpu.put(lookup), None
+        state = None
         for frame in frames:
             inputs = clip_frame(frame, network).inputs
-            outputs = network(inputs, lookup, state)
+            outputs = network(inputs, state)
             selection = select(outputs, state, config)
             state = network.advance(state, outputs, selection.instances, inputs, selection.lost)
             made = [outputs.queries, outputs.segmentation, outputs.bev, *vars(selection.detections).values()]
@@ -105,13 +106,12 @@ def test_a_stream_stays_on_the_gpu(name):
 def test_a_training_step_of_the_papers_network_stays_on_the_gpu(stage):
     config = small_config("paper-nuscenes")
     network = network_of(config)
-    pillars = small_pillars(config)
     frames = [instant(config, number, SIZE, 2) for number in range(FRAMES)]
     with pretended_gpu() as gpu:
         gpu.put_network(network)
         clip = [clip_frame(frame, network) for frame in frames]
         generator = torch.Generator().manual_seed(0)
-        terms = clip_losses(network, gpu.put(pillars), clip, stage, ClipSettings(), 1000, generator)
+        terms = clip_losses(network, clip, stage, ClipSettings(), 1000, generator)
         assert all(term.device == gpu.device for term in terms.values())
         assert ("transformation" in terms) == stage.vectors
         optimise(network, terms, gpu)
@@ -131,10 +131,10 @@ def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
     )
     plan = StreamPlan.start(STREAMS)
     fresh = torch.tensor([True, False])
-    clip = Clip(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
+    clip = StreamSegment(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
     with pretended_gpu() as gpu:
         gpu.put_network(network)
-        stage = TemporalStage(network, None, None, settings, tmp_path, Workers())
+        stage = TemporalStage(network, None, settings, tmp_path, ProcessGroup())
         for step in range(2):
             terms = stage.losses(step, clip)
         assert all(term.device == gpu.device for term in terms.values())

@@ -7,7 +7,7 @@ from predmapnet.config import MapTrackerQuirks
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import StreamState
 from predmapnet.network.track_selection import instances_from_rows
-from tests.predmapnet.network.small_baseline import frames, small_config, small_network, small_pillars, step, together
+from tests.predmapnet.network.small_baseline import frames, small_config, small_network, step, together
 
 OFF = {
     "semantic_queries": {"enabled": False},
@@ -94,11 +94,11 @@ def test_gradient_reaches_every_parameter(quirks):
     for parameter in network.parameters():
         if not parameter.any():
             torch.nn.init.normal_(parameter, std=0.1)
-    pillars, state, loss = small_pillars(config), None, torch.zeros(())
+    state, loss = None, torch.zeros(())
     for number, both in enumerate(zip(frames(3, 0), frames(3, 1), strict=True)):
         inputs = together(list(both))
-        outputs = network(inputs, pillars, state)
-        count = outputs.row_valid.shape[1]
+        outputs = network(inputs, state)
+        count = outputs.query_valid.shape[1]
         rows = torch.arange(count - 4, count).expand(2, -1)
         instances = instances_from_rows(outputs, rows, rows >= 0, torch.arange(4).expand(2, -1) + 2 * number)
         state = network.advance(state, outputs, instances, inputs)

@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.network.calibration import Calibration
 from predmapnet.network.polylines import clip_polylines
 from predmapnet.network.revival import point_line_distances
 from predmapnet.network.state import FrameInputs, FrameOutputs, LayerPredictions, StreamState
@@ -46,7 +47,7 @@ class Drive:
         """Show each stream its (label, line) pairs; returns the ids of the lines, None for those without a track."""
         poses = torch.stack([pose_at()] * len(seen) if pose is None else [pose] * len(seen))
         outputs = self.outputs(seen, poses)
-        inputs = FrameInputs(torch.zeros(0), torch.zeros(0), poses)
+        inputs = FrameInputs(torch.zeros(0), torch.zeros(0), poses, Calibration.empty(len(poses)))
         self.selection = select(outputs, self.state, self.network.config)
         lost = self.selection.lost
         self.state = self.network.advance(self.state, outputs, self.selection.instances, inputs, lost)
@@ -84,8 +85,8 @@ class Drive:
         return FrameOutputs(
             layers=[LayerPredictions(logits, shapes, torch.zeros(streams, total, *config.mask_size))],
             queries=queries,
-            row_valid=torch.cat([self.state.instances.valid, torch.ones(streams, rows, dtype=torch.bool)], dim=1),
-            row_track_ids=torch.cat([self.state.instances.track_ids, torch.full((streams, rows), -1)], dim=1),
+            query_valid=torch.cat([self.state.instances.valid, torch.ones(streams, rows, dtype=torch.bool)], dim=1),
+            query_track_ids=torch.cat([self.state.instances.track_ids, torch.full((streams, rows), -1)], dim=1),
             segmentation=torch.zeros(1),
             bev=torch.zeros(streams, config.temporal_bev.channels, config.bev.rows, config.bev.columns),
             ego_to_global=poses,

@@ -36,8 +36,8 @@ def outputs(rows, state=None):
     return FrameOutputs(
         layers=[LayerPredictions(logits, (lines / ROI + 0.5)[None], torch.zeros(1, len(rows), 5, 10))],
         queries=torch.arange(len(rows)).float().reshape(1, -1, 1),
-        row_valid=torch.ones(1, len(rows), dtype=torch.bool),
-        row_track_ids=torch.tensor([ids + [-1] * (len(rows) - len(ids))]),
+        query_valid=torch.ones(1, len(rows), dtype=torch.bool),
+        query_track_ids=torch.tensor([ids + [-1] * (len(rows) - len(ids))]),
         segmentation=torch.zeros(1),
         bev=torch.zeros(1),
         ego_to_global=torch.eye(4, dtype=torch.float64)[None],
@@ -112,7 +112,7 @@ def test_without_merging_thresholds_alone_decide():
     assert ids(gone.instances) == []
 
 
-def test_ids_are_never_used_again(network, lookup, make_inputs):
+def test_ids_are_never_used_again(network, make_inputs):
     """A stream in which tracks end and begin all the time."""
     rules = network.config.model_copy(
         update={"tracking": network.config.tracking.model_copy(update={"tau_d": 0.05, "tau_t": 0.05, "merge": False})}
@@ -123,7 +123,7 @@ def test_ids_are_never_used_again(network, lookup, make_inputs):
     for number in range(12):
         inputs = make_inputs(2, seed=number, x=20.0 * number)
         with torch.no_grad():
-            frame = network(inputs, lookup, state)
+            frame = network(inputs, state)
             chosen = select(frame, state, rules).instances
             state = network.advance(state, frame, chosen, inputs)
         for stream in range(2):

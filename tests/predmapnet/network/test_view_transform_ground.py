@@ -7,35 +7,52 @@ import pytest
 import torch
 
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.image_input import crop_image, image_window, mirror_order, mirror_rig
+from predmapnet.network.calibration import calibrate, collate_calibrations
+from predmapnet.network.image_input import crop_image, image_window, mirror_rig
 from predmapnet.network.layers import cell_centres
 from predmapnet.network.small.backbone import STRIDE
-from predmapnet.network.small.ground_lookup import make_rig_lookup, to_ground
+from predmapnet.network.small.ground_lookup import find_on_ground, ground_points, to_ground
 from predmapnet.presets import preset
 
 CONFIG = preset("lite")
-LOOKUP = make_rig_lookup(DEMO_RIG, CONFIG)
-CELLS = (cell_centres(*LOOKUP.grid).double().numpy() - 0.5) * CONFIG.roi.size
+GRID = (100, 200)
+SIZE = (CONFIG.image.height // STRIDE, CONFIG.image.width // STRIDE)
+CELLS = (cell_centres(*GRID).double().numpy() - 0.5) * CONFIG.roi.size
+
+
+def look_up(rig, height=0.0, batch=1):
+    calibration = collate_calibrations([calibrate(rig, CONFIG)] * batch)
+    return find_on_ground(ground_points(GRID, height, CONFIG.roi), calibration, SIZE, STRIDE)
+
+
+def on_grid(features, valid, lookup):
+    """Features ``(B, C, rows, columns)`` on the ground."""
+    return to_ground(features, valid, lookup).transpose(1, 2).unflatten(2, GRID)
+
+
+LOOKUP = look_up(DEMO_RIG)
+VISIBLE = LOOKUP.visible[0]
 EVERYWHERE = torch.ones(1, len(DEMO_RIG), dtype=torch.bool)
 
 
-def project(ground, camera):
+def project(ground, camera, height=0.0):
     """Pixels (u, v) of ground points in the stored image, and depth."""
-    points = np.column_stack([ground, np.zeros(len(ground)), np.ones(len(ground))])
+    points = np.column_stack([ground, np.full(len(ground), height), np.ones(len(ground))])
     in_camera = (points @ np.linalg.inv(camera.camera_to_ego).T)[:, :3]
     pixels = in_camera @ camera.intrinsics.T
     return pixels[:, :2] / pixels[:, 2:], in_camera[:, 2]
 
 
-def test_features_that_say_where_they_are_arrive_where_projection_puts_them():
-    rows, columns = LOOKUP.feature_size
-    v, u = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
-    features = (torch.stack([u, v]) * STRIDE).expand(1, len(DEMO_RIG), 2, rows, columns)
-    alone = LOOKUP.visible.sum(dim=1) == 1
-    ground = to_ground(features, EVERYWHERE, LOOKUP)[0].flatten(1).T
+@pytest.mark.parametrize("height", [0.0, -0.5, 0.7])
+def test_features_that_say_where_they_are_arrive_where_projection_puts_them(height):
+    v, u = torch.meshgrid(torch.arange(SIZE[0]) + 0.5, torch.arange(SIZE[1]) + 0.5, indexing="ij")
+    features = (torch.stack([u, v]) * STRIDE).expand(1, len(DEMO_RIG), 2, *SIZE)
+    lookup = look_up(DEMO_RIG, height)
+    alone = lookup.visible[0].sum(dim=1) == 1
+    ground = to_ground(features, EVERYWHERE, lookup)[0]
     for number, camera in enumerate(DEMO_RIG):
-        seen = (alone & (LOOKUP.visible[:, number] == 1)).numpy()
-        expected, _ = project(CELLS.reshape(-1, 2)[seen], camera)
+        seen = (alone & (lookup.visible[0, :, number] == 1)).numpy()
+        expected, _ = project(CELLS.reshape(-1, 2)[seen], camera, height)
         window = image_window(camera, CONFIG.image)
         expected = expected * window.scaled_width / camera.width - [0, window.top]
         inner = ((expected > 2) & (expected < [CONFIG.image.width - 2, CONFIG.image.height - 2])).all(axis=1)
@@ -53,16 +70,16 @@ def test_a_bright_spot_on_the_ground_lights_the_cell_below_it(camera, point):
     features = torch.zeros(1, len(DEMO_RIG), 1, CONFIG.image.height // STRIDE, CONFIG.image.width // STRIDE)
     pooled = torch.nn.functional.avg_pool2d(torch.from_numpy(window[..., 0]).float()[None], STRIDE)
     features[0, camera, 0] = pooled[0]
-    ground = to_ground(features, EVERYWHERE, LOOKUP)[0, 0].double().numpy()
+    ground = on_grid(features, EVERYWHERE, LOOKUP)[0, 0].double().numpy()
     centre = (CELLS * ground[..., None]).sum(axis=(0, 1)) / ground.sum()
     np.testing.assert_allclose(centre, point, atol=0.7)  # half of what one feature pixel covers there
 
 
 def test_mean_over_valid_cameras_only_and_nothing_where_none_looks():
-    features = torch.arange(1.0, len(DEMO_RIG) + 1).reshape(1, -1, 1, 1, 1).expand(1, -1, 1, *LOOKUP.feature_size)
+    features = torch.arange(1.0, len(DEMO_RIG) + 1).reshape(1, -1, 1, 1, 1).expand(1, -1, 1, *SIZE)
     valid = torch.tensor([[True, True, False, True, False, True]])
-    ground = to_ground(features, valid, LOOKUP)[0, 0].flatten()
-    looking = LOOKUP.visible * valid
+    ground = to_ground(features, valid, LOOKUP)[0, :, 0]
+    looking = VISIBLE * valid
     expected = (looking @ torch.arange(1.0, 7.0)) / looking.sum(dim=1).clamp(min=1)
     assert (looking.sum(dim=1) == 0).any() and (looking.sum(dim=1) == 2).any()
     torch.testing.assert_close(ground, expected)
@@ -70,33 +87,30 @@ def test_mean_over_valid_cameras_only_and_nothing_where_none_looks():
 
 def test_the_backward_pass_is_the_transpose_of_the_forward_pass():
     generator = torch.Generator().manual_seed(0)
-    shape = (2, len(DEMO_RIG), 3, *LOOKUP.feature_size)
+    shape, lookup = (2, len(DEMO_RIG), 3, *SIZE), look_up(DEMO_RIG, batch=2)
     features = torch.randn(shape, generator=generator, requires_grad=True)
-    probe = torch.randn(2, 3, *LOOKUP.grid, generator=generator)
+    probe = torch.randn(2, GRID[0] * GRID[1], 3, generator=generator)
     direction = torch.randn(shape, generator=generator)
-    (to_ground(features, EVERYWHERE.expand(2, -1), LOOKUP) * probe).sum().backward()
-    forward = (to_ground(direction, EVERYWHERE.expand(2, -1), LOOKUP) * probe).double().sum()
+    (to_ground(features, EVERYWHERE.expand(2, -1), lookup) * probe).sum().backward()
+    forward = (to_ground(direction, EVERYWHERE.expand(2, -1), lookup) * probe).double().sum()
     torch.testing.assert_close((features.grad * direction).double().sum(), forward, rtol=1e-4, atol=1e-2)
 
 
-def test_flipped_images_of_the_symmetric_rig_show_the_mirrored_ground():
-    order = mirror_order(DEMO_RIG)
-    assert order is not None
-    features = torch.rand(1, len(DEMO_RIG), 2, *LOOKUP.feature_size)
-    ground = to_ground(features, EVERYWHERE, LOOKUP)
-    mirrored = to_ground(features[:, list(order)].flip(-1), EVERYWHERE, LOOKUP)
-    torch.testing.assert_close(mirrored, ground.flip(2), atol=1e-4, rtol=0)
-
-
-def test_a_lopsided_rig_has_a_mirror_rig_but_no_mirror_order():
+def test_flipped_images_of_any_rig_show_the_mirrored_ground():
     pose = DEMO_RIG[1].camera_to_ego.copy()
     pose[:3, 3] += [0.3, 0.1, 0.0]
     rig = (DEMO_RIG[0], replace(DEMO_RIG[1], camera_to_ego=pose), *DEMO_RIG[2:])
-    assert mirror_order(rig) is None
-    features = torch.rand(1, len(rig), 2, *LOOKUP.feature_size)
-    ground = to_ground(features, EVERYWHERE, make_rig_lookup(rig, CONFIG))
-    mirrored = to_ground(features.flip(-1), EVERYWHERE, make_rig_lookup(mirror_rig(rig), CONFIG))
+    features = torch.rand(1, len(rig), 2, *SIZE)
+    ground = on_grid(features, EVERYWHERE, look_up(rig))
+    mirrored = on_grid(features.flip(-1), EVERYWHERE, look_up(mirror_rig(rig)))
     torch.testing.assert_close(mirrored, ground.flip(2), atol=1e-4, rtol=0)
+
+
+def test_rows_that_an_image_does_not_have_show_nothing():
+    low = tuple(replace(camera, height=200) for camera in DEMO_RIG)
+    assert calibrate(low, CONFIG).image_size[0, 0].tolist() == [CONFIG.image.width, 64.0]
+    v = (torch.arange(SIZE[0]) + 0.5)[:, None].expand(1, len(low), 1, *SIZE) * STRIDE
+    assert to_ground(v, EVERYWHERE, look_up(low)).max() <= 64.0
 
 
 def test_the_window_follows_the_horizon_of_a_pitched_camera_and_stays_in_the_image():

@@ -1,4 +1,4 @@
-"""Scenes without a renderer: random polylines, painted into black images through the projection of the demo rig."""
+"""Scenes without a renderer: random polylines, painted into black images through the projection of a rig."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.presets import preset
-from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.scene_cache import CachedScene, read_scene, write_scene
+from predmapnet.scenes import FrameTruth, Rig
+from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene, write_cached_scene
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))
 
@@ -36,7 +36,7 @@ def tiny_config() -> PredMapNetConfig:
     return PredMapNetConfig.model_validate(base)
 
 
-def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig) -> CachedScene:
+def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig, rig: Rig = DEMO_RIG) -> CachedScene:
     """Write and open a scene of a straight drive past a few lines and a crossing."""
     generator = np.random.default_rng(seed)
     lines = [
@@ -51,10 +51,10 @@ def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig
     for pose in poses:
         truth = _truth(lines, pose, config.roi)
         truths.append(truth)
-        images.append(_paint(truth, config))
+        images.append(_paint(truth, config, rig))
     sweeps = [generator.uniform([-40, -20, 0], [40, 20, 3], (2000, 3)) for _ in poses] if config.depth.enabled else None
-    write_scene(folder, DEMO_RIG, np.stack(images), poses, truths, sweeps)
-    return read_scene(folder)
+    write_cached_scene(folder, rig, np.stack(images), poses, truths, sweeps)
+    return read_cached_scene(folder)
 
 
 def _truth(lines: list, pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:
@@ -71,9 +71,9 @@ def _truth(lines: list, pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:
     )
 
 
-def _paint(truth: FrameTruth, config: PredMapNetConfig) -> np.ndarray:
+def _paint(truth: FrameTruth, config: PredMapNetConfig, rig: Rig) -> np.ndarray:
     images = []
-    for camera in DEMO_RIG:
+    for camera in rig:
         image = np.zeros((config.image.height, config.image.width, 3), np.uint8)
         intrinsics = window_intrinsics(camera, config.image)
         ego_to_camera = inverse_pose(camera.camera_to_ego)

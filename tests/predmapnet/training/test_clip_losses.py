@@ -10,7 +10,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.clip_settings import CLIP_STAGES, ClipSettings
+from predmapnet.training.settings import CLIP_STAGES, ClipSettings
 
 BEV, WARMUP, JOINT = CLIP_STAGES
 CALM = ClipSettings(angle_noise=0.0, distance_noise=0.0)
@@ -18,23 +18,22 @@ CONFIG = tiny_paper_config()
 
 
 @pytest.fixture(scope="module")
-def clip_and_rig(tmp_path_factory):
+def clip(tmp_path_factory):
     return painted_clip(tmp_path_factory.mktemp("clips"), CONFIG, frames=3)
 
 
-def losses(network, clip_and_rig, stage=JOINT, settings=CALM, step=1000, frames=3):
-    clip, rig = clip_and_rig
+def losses(network, clip, stage=JOINT, settings=CALM, step=1000, frames=3):
     generator = torch.Generator().manual_seed(0)
-    return clip_losses(network, network.make_rig_lookup(rig), clip[:frames], stage, settings, step, generator)
+    return clip_losses(network, clip[:frames], stage, settings, step, generator)
 
 
-def test_joint_training_reaches_every_parameter_and_learns(clip_and_rig):
+def test_joint_training_reaches_every_parameter_and_learns(clip):
     network = tiny_network(CONFIG)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3)
     totals = []
     for step in range(3):
         torch.manual_seed(0)
-        terms = losses(network, clip_and_rig, step=step)
+        terms = losses(network, clip, step=step)
         total = torch.stack(list(terms.values())).sum()
         optimiser.zero_grad()
         total.backward()
@@ -42,50 +41,48 @@ def test_joint_training_reaches_every_parameter_and_learns(clip_and_rig):
         optimiser.step()
         totals.append(float(total.detach()))
     assert {name for name, p in network.named_parameters() if p.grad is None} == set()
-    expected = {"segmentation", "segmentation_dice", "focal", "points", "mask", "generator", "depth"}
+    expected = {"segmentation", "segmentation_dice", "focal", "points", "mask", "depth"}
     assert set(terms) == expected | {"transformation", "forecast"}
     assert all(torch.isfinite(term) for term in terms.values())
     assert totals[-1] < totals[0]
 
 
-def test_the_first_stage_trains_the_segmentation_and_depth_only(clip_and_rig):
+def test_the_first_stage_trains_the_segmentation_and_depth_only(clip):
     network = tiny_network(CONFIG)
-    terms = losses(network, clip_and_rig, BEV, frames=2)
+    terms = losses(network, clip, BEV, frames=2)
     assert set(terms) == {"segmentation", "segmentation_dice", "depth"}
     torch.stack(list(terms.values())).sum().backward()
     reached = {name.split(".")[0] for name, p in network.named_parameters() if p.grad is not None}
     assert reached == {"image_backbone", "bev_encoder", "segmentation_head", "depth_head"}
 
 
-def test_images_learn_from_the_frames_of_their_stage_only(clip_and_rig):
-    clip, rig = clip_and_rig
+def test_images_learn_from_the_frames_of_their_stage_only(clip):
     for stage, learns in ((BEV, [True, False, True]), (JOINT, [False, False, True]), (WARMUP, [False] * 3)):
         frames = [replace(frame, inputs=replace(frame.inputs)) for frame in clip]
         for frame in frames:
             frame.inputs.images = frame.inputs.images.clone().requires_grad_()
-        terms = losses(tiny_network(CONFIG), (frames, rig), stage)
+        terms = losses(tiny_network(CONFIG), frames, stage)
         torch.stack(list(terms.values())).sum().backward()
         assert [frame.inputs.images.grad is not None for frame in frames] == learns
 
 
-def test_a_memory_that_is_not_used_yet_changes_nothing(clip_and_rig):
+def test_a_memory_that_is_not_used_yet_changes_nothing(clip):
     network = tiny_network(CONFIG).eval()
     for module in network.modules():
         if isinstance(module, torch.nn.Dropout | torch.nn.MultiheadAttention):
             module.dropout = 0.0
     with torch.no_grad():
-        before = losses(network, clip_and_rig, WARMUP, step=0)
-        late = losses(network, clip_and_rig, WARMUP, step=WARMUP.memory_from_step)
+        before = losses(network, clip, WARMUP, step=0)
+        late = losses(network, clip, WARMUP, step=WARMUP.memory_from_step)
         for layer in network.map_decoder.layers:
             torch.nn.init.normal_(layer.memory_attention.attention.out_proj.bias)
-        changed = losses(network, clip_and_rig, WARMUP, step=WARMUP.memory_from_step)
-        unchanged = losses(network, clip_and_rig, WARMUP, step=0)
+        changed = losses(network, clip, WARMUP, step=WARMUP.memory_from_step)
+        unchanged = losses(network, clip, WARMUP, step=0)
     assert all(torch.equal(before[name], unchanged[name]) for name in before)
     assert float(changed["points"]) != pytest.approx(float(late["points"]), rel=1e-4)
 
 
-def test_without_truth_there_is_only_background(clip_and_rig):
-    clip, rig = clip_and_rig
+def test_without_truth_there_is_only_background(clip):
     nothing = torch.zeros(0, dtype=torch.int64)
     empty = [
         replace(
@@ -102,11 +99,11 @@ def test_without_truth_there_is_only_background(clip_and_rig):
         )
         for frame in clip
     ]
-    terms = losses(tiny_network(CONFIG), (empty, rig))
+    terms = losses(tiny_network(CONFIG), empty)
     assert float(terms["points"].detach()) == float(terms["mask"].detach()) == float(terms["forecast"].detach()) == 0.0
     assert float(terms["focal"].detach()) > 0.0
 
 
-def test_a_network_without_tracks_of_this_kind_is_refused(clip_and_rig):
+def test_a_network_without_tracks_of_this_kind_is_refused(clip):
     with pytest.raises(UserError, match="lite does not train in clips"):
-        clip_losses(PredMapNet(preset("lite")), None, clip_and_rig[0], JOINT, CALM, 0, torch.Generator())
+        clip_losses(PredMapNet(preset("lite")), clip, JOINT, CALM, 0, torch.Generator())

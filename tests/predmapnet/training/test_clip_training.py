@@ -12,14 +12,13 @@ from tiny_clips import tiny_paper_config
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
-from predmapnet.training.clip_settings import BEV_PARTS, CLIP_STAGES, ClipSettings
 from predmapnet.training.clips import ClipTraining, ImageClips
 from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.data.depth_targets import UNKNOWN
 from predmapnet.training.loop import Trainer
 from predmapnet.training.optimiser import make_optimiser
-from predmapnet.training.settings import Budget, plan_run
-from predmapnet.training.workers import Workers
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import BEV_PARTS, CLIP_STAGES, Budget, ClipSettings, plan_run
 
 CONFIG = tiny_paper_config()
 SETTINGS = replace(plan_run(CONFIG, "all", 1.0, 1), clips=ClipSettings(frames=2, span=3), log_steps=1)
@@ -28,16 +27,15 @@ SETTINGS = replace(plan_run(CONFIG, "all", 1.0, 1), clips=ClipSettings(frames=2,
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes")
-    return TrainingScenes([painted_scene(folder / f"scene-{seed}", 5, seed, CONFIG) for seed in range(2)])
+    return TrainingScenes([painted_scene(folder / f"scene-{seed}", 5, seed, CONFIG) for seed in range(2)], CONFIG)
 
 
 def test_a_run_goes_through_all_stages_and_freezes_what_they_leave(scenes, tmp_path):
     torch.manual_seed(0)
     network = PredMapNet(CONFIG)
-    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
-    trainer = Trainer(network, SETTINGS, tmp_path, Workers(), lambda _line: None)
+    trainer = Trainer(network, SETTINGS, tmp_path, ProcessGroup(), lambda _line: None)
     for stage, budget in SETTINGS.clip_stages:
-        trainable = ClipTraining(stage, network, lookup, scenes, SETTINGS, Workers())
+        trainable = ClipTraining(stage, network, scenes, SETTINGS, ProcessGroup())
         frozen = [getattr(network, part) for part in stage.frozen]
         before = [{name: value.clone() for name, value in part.named_parameters()} for part in frozen]
         optimiser = replace(SETTINGS.clip_optimiser, rates=stage.rates, average_decay=0.0)
@@ -65,8 +63,8 @@ def test_clips_end_with_their_frame_and_repeat_for_a_seed(scenes):
 
 
 def test_a_plan_shares_out_the_time_and_refuses_stages_of_other_networks():
-    shares = [budget for _, budget in plan_run(CONFIG, "all", 70.0, None).clip_stages]
-    assert shares == [Budget(18.0), Budget(4.0), Budget(48.0)]
+    shares = [budget for _, budget in plan_run(CONFIG, "all", 72.0, None).clip_stages]
+    assert shares == [Budget(18.0), Budget(6.0), Budget(48.0)]
     assert [stage.name for stage, _ in plan_run(CONFIG, "joint", 70.0, 3).clip_stages] == ["joint"]
     lite = plan_run(preset("lite"), "all", 60.0, None)
     assert (lite.single, lite.temporal, lite.clip_stages) == (Budget(40.0), Budget(pytest.approx(20.0)), ())

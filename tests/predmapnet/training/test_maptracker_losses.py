@@ -8,12 +8,12 @@ from predmapnet.training.losses.maptracker import (
     CLASS_WEIGHT,
     LINE_WEIGHT,
     all_orders,
-    assign,
-    class_cost,
+    assign_layer,
     layer_losses,
     line_cost,
     segmentation_losses,
 )
+from predmapnet.training.losses.matching import focal_class_cost
 from tests.predmapnet.network.maptracker_reference import FOLDER, load_reference
 
 pytestmark = pytest.mark.reference
@@ -44,7 +44,7 @@ def test_costs(given, expected):
     distance, order = line_cost(given["lines"][:count], given["gt_lines"])
     close(distance, expected["reg_cost_unweighted"])
     close(
-        CLASS_WEIGHT * class_cost(given["logits"][:count], given["gt_labels"]) + LINE_WEIGHT * distance,
+        CLASS_WEIGHT * focal_class_cost(given["logits"][:count])[:, given["gt_labels"]] + LINE_WEIGHT * distance,
         expected["cost"],
     )
     assert torch.equal(order, expected["best_permutation"])
@@ -60,7 +60,7 @@ def test_assignment_and_losses_of_a_layer(given, expected, case):
         detection[:4], detection[104:], valid[104:] = False, False, False
         for row, truth in TRACKS.items():
             continued[row] = truth
-    targets = assign(logits, lines, given["gt_lines"], given["gt_labels"], detection, continued)
+    targets = assign_layer(logits, lines, given["gt_lines"], given["gt_labels"], detection, continued)
     assert torch.equal(targets.rows, expected[f"{case}/pos_query"])
     assert torch.equal(targets.truth, expected[f"{case}/pos_gt"])
     assert torch.equal(targets.labels, expected[f"{case}/target_labels"])

@@ -9,8 +9,8 @@ from torch import nn
 
 from mapfusion.geometry import inverse_pose
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.network.image_input import mirror_order
-from predmapnet.scenes import FrameTruth
+from predmapnet.network.image_input import mirror_rig
+from predmapnet.scenes import Camera, FrameTruth
 from predmapnet.training.data.augmentation import (
     mirror_images,
     mirror_pose,
@@ -46,10 +46,8 @@ def test_the_rate_warms_up_and_falls_with_the_budget() -> None:
 
 def test_mirroring_twice_changes_nothing() -> None:
     generator = np.random.default_rng(0)
-    order = mirror_order(DEMO_RIG)
-    assert order is not None
     images = generator.integers(0, 255, (6, 8, 12, 3), dtype=np.uint8)
-    assert np.array_equal(mirror_images(mirror_images(images, order), order), images)
+    assert np.array_equal(mirror_images(mirror_images(images)), images)
     truth = FrameTruth(np.array([1]), (generator.normal(size=(4, 2)),), np.array([3]))
     assert np.array_equal(mirror_truth(mirror_truth(truth)).polylines[0], truth.polylines[0])
     angle = 0.3
@@ -62,20 +60,17 @@ def test_mirroring_twice_changes_nothing() -> None:
 
 
 def test_mirrored_truth_lies_where_the_mirrored_images_show_it() -> None:
-    order = mirror_order(DEMO_RIG)
-    assert order is not None
     points = np.random.default_rng(1).uniform([-25, -12], [25, 12], (200, 2))
-    for place, source in enumerate(order):
-        seen, columns = pixels_of(points, source)
-        mirrored_seen, mirrored_columns = pixels_of(points * [1, -1], place)
+    for camera, mirrored in zip(DEMO_RIG, mirror_rig(DEMO_RIG), strict=True):
+        seen, columns = pixels_of(points, camera)
+        mirrored_seen, mirrored_columns = pixels_of(points * [1, -1], mirrored)
         assert np.array_equal(seen, mirrored_seen)
         flipped = columns.copy()
-        flipped[:, 0] = DEMO_RIG[place].width - flipped[:, 0]
+        flipped[:, 0] = camera.width - flipped[:, 0]
         assert np.allclose(flipped, mirrored_columns, atol=1e-6)
 
 
-def pixels_of(points: np.ndarray, camera_index: int) -> tuple[np.ndarray, np.ndarray]:
-    camera = DEMO_RIG[camera_index]
+def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     ground = np.concatenate([points, np.zeros((len(points), 1)), np.ones((len(points), 1))], 1)
     rays = (ground @ inverse_pose(camera.camera_to_ego).T)[:, :3]
     seen = rays[:, 2] > 0.5

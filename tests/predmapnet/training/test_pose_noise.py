@@ -1,4 +1,4 @@
-"""Noise of the ego motion turns and shifts what tracks remember, and nothing else."""
+"""Noise of the ego motion turns and shifts what tracks store_queries, and nothing else."""
 
 import numpy as np
 import pytest

@@ -14,14 +14,14 @@ from painted_scenes import painted_scene, tiny_config
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training import checkpoint
+from predmapnet.training import run_checkpoint
 from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
+from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.run import RunOptions, train
 from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings
 from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
-from predmapnet.training.workers import Workers
 
 SETTINGS = TrainingSettings(
     batch=2,
@@ -45,7 +45,7 @@ def one_thread() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> TrainingScenes:
     folder = tmp_path_factory.mktemp("scenes")
-    return TrainingScenes([painted_scene(folder / f"scene-{i}", 6, i, tiny_config()) for i in range(2)])
+    return TrainingScenes([painted_scene(folder / f"scene-{i}", 6, i, tiny_config()) for i in range(2)], tiny_config())
 
 
 class PowerCutError(Exception):
@@ -55,12 +55,11 @@ class PowerCutError(Exception):
 def run(folder: Path, scenes: TrainingScenes, resume: bool = False, cut_at: tuple[str, int] | None = None) -> Trainer:
     torch.manual_seed(3)
     network = PredMapNet(tiny_config())
-    lookup = network.make_rig_lookup(scenes.scenes[0].rig)
-    trainer = Trainer(network, SETTINGS, folder, Workers(), lambda _line: None)
+    trainer = Trainer(network, SETTINGS, folder, ProcessGroup(), lambda _line: None)
     if resume:
         trainer.resume()
-    single = SingleFrameStage(network, lookup, scenes, SETTINGS, Workers())
-    temporal = TemporalStage(network, lookup, scenes, SETTINGS, folder, Workers(), lambda _line: None)
+    single = SingleFrameStage(network, scenes, SETTINGS, ProcessGroup())
+    temporal = TemporalStage(network, scenes, SETTINGS, folder, ProcessGroup(), lambda _line: None)
     for stage, budget in ((single, SETTINGS.single), (temporal, SETTINGS.temporal)):
         if cut_at is not None and stage.name == cut_at[0]:
             cut(stage, cut_at[1])
@@ -111,16 +110,16 @@ def test_only_the_newest_checkpoint_stays_and_half_of_one_is_ignored(tmp_path: P
     run(tmp_path, scenes)
     assert len(list(tmp_path.glob("step-*"))) == 1
     (tmp_path / ".step-099999999.partial").mkdir()
-    newest = checkpoint.latest(tmp_path)
+    newest = run_checkpoint.latest(tmp_path)
     assert newest is not None
-    assert checkpoint.read_json(newest / "position.json")["finished"] == ["single", "temporal"]
+    assert run_checkpoint.read_json(newest / "position.json")["finished"] == ["single", "temporal"]
 
 
 def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Path, scenes: TrainingScenes) -> None:
     with pytest.raises(UserError, match="no checkpoint"):
         run(tmp_path / "empty", scenes, resume=True)
     run(tmp_path / "damaged", scenes)
-    newest = checkpoint.latest(tmp_path / "damaged")
+    newest = run_checkpoint.latest(tmp_path / "damaged")
     assert newest is not None
     (newest / "network.safetensors").write_bytes(b"cut short")
     with pytest.raises(UserError, match="damaged"):
@@ -129,7 +128,7 @@ def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Pat
 
 def test_streams_of_an_older_version_go_on_without_their_past(tmp_path: Path, scenes: TrainingScenes) -> None:
     network = PredMapNet(tiny_config())
-    stage = TemporalStage(network, network.make_rig_lookup(scenes.scenes[0].rig), scenes, SETTINGS, tmp_path, Workers())
+    stage = TemporalStage(network, scenes, SETTINGS, tmp_path, ProcessGroup())
     whole = stage.state()
     older = {name.removeprefix("state."): value for name, value in whole.items() if name.startswith("state.instances.")}
     older |= {name: value for name, value in whole.items() if name.startswith(("plan.", "owners."))}

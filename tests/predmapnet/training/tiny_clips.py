@@ -9,6 +9,7 @@ import torch
 from painted_scenes import painted_scene
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
@@ -43,10 +44,8 @@ def tiny_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
     return network
 
 
-def painted_clip(
-    folder: Path, config: PredMapNetConfig, frames: int, streams: int = 2
-) -> tuple[list[ClipFrame], tuple]:
-    """The first frames of painted scenes, with random depth, and their rig."""
+def painted_clip(folder: Path, config: PredMapNetConfig, frames: int, streams: int = 2) -> list[ClipFrame]:
+    """The first frames of painted scenes, with random depth."""
     scenes = [painted_scene(folder / f"scene-{seed}", frames, seed, config) for seed in range(streams)]
     generator = torch.Generator().manual_seed(0)
     clip = []
@@ -56,9 +55,10 @@ def painted_clip(
             images=normalise_images(images, config.image),
             camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
             ego_to_global=torch.from_numpy(np.stack([scene.ego_to_global[index] for scene in scenes])),
+            calibration=collate_calibrations([calibrate(scene.rig, config) for scene in scenes]),
         )
         cells = (streams, images.shape[1], config.image.height // 8, config.image.width // 8)
         depth = torch.randint(-1, config.depth.bins, cells, generator=generator)
         targets = truth_targets([scene.truths[index] for scene in scenes], config.roi, config.decoder.points, GRID)
         clip.append(ClipFrame(inputs, targets, depth))
-    return clip, scenes[0].rig
+    return clip

@@ -1,9 +1,9 @@
-"""Where the cells of the BEV grid are seen in the images: computed once per camera rig."""
+"""Reference points of BEVFormer: where the pillars of the BEV cells are seen in the images of each frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,24 +17,24 @@ NEAREST_DEPTH = 1e-5
 
 
 @dataclass(frozen=True)
-class CameraPillars:
-    """Pairs of a camera and a BEV cell that it sees, and where it sees it. Belongs to a rig, not to the network.
+class ReferencePoints:
+    """Pairs of a camera and a BEV cell that it sees, in ``B`` frames of ``N`` cameras, and where it sees it.
 
     A cell is a pillar of ``Z`` points. A camera that sees one of them takes part with all; those outside its image
     find nothing there.
 
     Attributes:
-        camera: ``(P,) int64``; pairs are ordered by camera, then cell.
-        cell: ``(P,) int64``, row by row.
+        camera: ``(P,) int64``, among all ``B * N``; pairs are ordered by camera, then cell.
+        cell: ``(P,) int64``, among all ``B * H * W`` of the frames, row by row.
         positions: ``(P, Z, 2)``, x and y in the image, 0 to 1 where inside.
-        sees: ``(cells, N) float32``, 1 where a camera takes part.
+        visible: ``(B, N, H * W) bool``, whether a camera takes part.
         level_sizes: rows and columns of each feature level.
     """
 
     camera: Tensor
     cell: Tensor
     positions: Tensor
-    sees: Tensor
+    visible: Tensor
     level_sizes: tuple[tuple[int, int], ...]
 
     @property
@@ -42,48 +42,42 @@ class CameraPillars:
         """Pixels of all levels of one camera."""
         return sum(rows * columns for rows, columns in self.level_sizes)
 
-    def to(self, device: torch.device | str) -> CameraPillars:
-        """Return a copy on ``device``."""
-        moved = {name: getattr(self, name).to(device) for name in ("camera", "cell", "positions", "sees")}
-        return replace(self, **moved)
 
-
-def make_camera_pillars(
-    ego_to_image: Tensor, image_size: tuple[int, int], config: BevFormerConfig, roi: RegionOfInterest
-) -> CameraPillars:
-    """Project the pillars of all cells into all cameras.
+def find_references(ego_to_image: Tensor, image_size: tuple[int, int], pillars: Tensor) -> ReferencePoints:
+    """Project the pillars of all cells into all cameras of all frames.
 
     Args:
-        ego_to_image: ``(N, 4, 4) float64``; maps metres of the ego frame to (u depth, v depth, depth, 1) in pixels of
-            the network's input.
+        ego_to_image: ``(B, N, 3, 4) float64`` of :class:`~predmapnet.network.calibration.Calibration`.
         image_size: rows and columns of the network's input.
-        config: grid and pillars.
-        roi: the region that the grid covers.
+        pillars: of :func:`pillar_points`.
     """
-    positions, hits = project_pillars(ego_to_image, image_size, config, roi)
-    sees = hits.any(dim=-1)
-    camera, cell = sees.nonzero(as_tuple=True)
+    batch, cameras = ego_to_image.shape[:2]
+    positions, hits = project_pillars(ego_to_image.flatten(0, 1), image_size, pillars)
+    visible = hits.any(dim=-1)
+    camera, cell = visible.nonzero(as_tuple=True)
     height, width = image_size
-    return CameraPillars(
+    return ReferencePoints(
         camera=camera,
-        cell=cell,
+        cell=camera // max(cameras, 1) * len(pillars) + cell,
         positions=positions[camera, cell],
-        sees=sees.T.float().contiguous(),
+        visible=visible.unflatten(0, (batch, cameras)),
         level_sizes=tuple((-(-height // stride), -(-width // stride)) for stride in LEVEL_STRIDES),
     )
 
 
-def project_pillars(
-    ego_to_image: Tensor, image_size: tuple[int, int], config: BevFormerConfig, roi: RegionOfInterest
-) -> tuple[Tensor, Tensor]:
+def project_pillars(ego_to_image: Tensor, image_size: tuple[int, int], pillars: Tensor) -> tuple[Tensor, Tensor]:
     """Project every point of every pillar.
 
+    Args:
+        ego_to_image: ``(M, 3, 4) float64``, of ``M`` cameras.
+        image_size: rows and columns of the network's input.
+        pillars: ``(cells, Z, 4) float32`` of :func:`pillar_points`.
+
     Returns:
-        Positions ``(N, cells, Z, 2) float32`` in the images, 0 to 1 where inside, and which points are inside, as
-        ``(N, cells, Z) bool``.
+        Positions ``(M, cells, Z, 2) float32`` in the images, 0 to 1 where inside, and which points are inside, as
+        ``(M, cells, Z) bool``.
     """
-    points = _pillars(config, roi).to(ego_to_image.device)
-    projected = torch.einsum("nij,czj->nczi", ego_to_image.float(), points)
+    projected = torch.einsum("nij,czj->nczi", ego_to_image.float(), pillars)
     depth = projected[..., 2]
     height, width = image_size
     size = projected.new_tensor([width, height])
@@ -92,8 +86,8 @@ def project_pillars(
     return positions, inside & (depth > NEAREST_DEPTH)
 
 
-def _pillars(config: BevFormerConfig, roi: RegionOfInterest) -> Tensor:
-    """Return the points ``(cells, Z, 4) float32`` in the ego frame, homogeneous."""
+def pillar_points(config: BevFormerConfig, roi: RegionOfInterest) -> Tensor:
+    """Return the points ``(cells, Z, 4) float32`` of all pillars in the ego frame, metres, homogeneous."""
     ground = (cell_centres(config.rows, config.columns).double() - 0.5) * torch.tensor(roi.size)
     heights = torch.linspace(config.pillar_low, config.pillar_high, config.pillar_points, dtype=torch.float64)
     ground = ground.view(-1, 1, 2).expand(-1, len(heights), 2)

@@ -1,4 +1,4 @@
-"""A training run on disk: tensors in safetensors, everything else in JSON, replaced in one step."""
+"""Checkpoint of a training run: tensors in safetensors, everything else in JSON, replaced in one step."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from predmapnet.errors import UserError
 
-PREFIX = "step-"
+CHECKPOINT_PREFIX = "step-"
 _SHOWN_NAMES = 4
 
 
@@ -55,7 +55,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
 
 def partial_folder(folder: Path, order: int) -> Path:
     """Name of the folder in which the parts of a checkpoint are gathered; later ones have a larger ``order``."""
-    return folder / f".{PREFIX}{order:09d}.partial"
+    return folder / f".{CHECKPOINT_PREFIX}{order:09d}.partial"
 
 
 def prepare(folder: Path, order: int) -> None:
@@ -70,7 +70,7 @@ def publish(partial: Path) -> Path:
     target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
     shutil.rmtree(target, ignore_errors=True)
     partial.rename(target)
-    for older in partial.parent.glob(f"{PREFIX}*"):
+    for older in partial.parent.glob(f"{CHECKPOINT_PREFIX}*"):
         if older != target:
             shutil.rmtree(older)
     return target
@@ -78,7 +78,7 @@ def publish(partial: Path) -> Path:
 
 def latest(folder: Path) -> Path | None:
     """Return the newest complete checkpoint below ``folder``, or None."""
-    return max(folder.glob(f"{PREFIX}*"), default=None)
+    return max(folder.glob(f"{CHECKPOINT_PREFIX}*"), default=None)
 
 
 def to_resume(folder: Path) -> Path:

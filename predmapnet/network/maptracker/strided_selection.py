@@ -1,4 +1,4 @@
-"""Which past frames are looked at again: MapTracker's strided selection."""
+"""Strided selection (MapTracker): past frames are chosen by the distance that the car has driven since."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 
-def choose_history(
+def select_strided(
     travelled: Tensor, valid: Tensor, distances: Sequence[float], fallback: Literal["latest", "nearest"]
 ) -> tuple[Tensor, Tensor]:
     """Choose entries that lie about as far back as wanted.

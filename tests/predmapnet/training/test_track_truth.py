@@ -14,7 +14,7 @@ from predmapnet.training.data.targets import Targets, truth_targets
 from predmapnet.training.losses.lite import LossWeights, frame_losses
 from predmapnet.training.losses.matching import Assignment, MatchingCosts
 from predmapnet.training.settings import StreamSettings
-from predmapnet.training.tracks import Owners, choose_tracks, owned_truth
+from predmapnet.training.track_truth import TrackTruth, choose_tracks, truth_of_tracks
 
 ROI = RegionOfInterest()
 SIZE = torch.tensor([60.0, 30.0])
@@ -36,17 +36,17 @@ def outputs_at(heights: list[float], scores: list[float]) -> FrameOutputs:
     return FrameOutputs(
         layers=[LayerPredictions(logits, points, None)],
         queries=torch.zeros(1, rows, 4),
-        row_valid=torch.ones(1, rows, dtype=torch.bool),
-        row_track_ids=torch.full((1, rows), -1),
+        query_valid=torch.ones(1, rows, dtype=torch.bool),
+        query_track_ids=torch.full((1, rows), -1),
         segmentation=torch.zeros(1, 3, 10, 20),
         bev=torch.zeros(1, 0, 10, 20),
         ego_to_global=torch.eye(4, dtype=torch.float64)[None],
     )
 
 
-def owners_of(*element_ids: int) -> Owners:
+def owners_of(*element_ids: int) -> TrackTruth:
     ids = torch.tensor([element_ids])
-    return Owners(torch.where(ids >= 0, 1, -1), ids)
+    return TrackTruth(torch.where(ids >= 0, 1, -1), ids)
 
 
 def test_a_track_answers_for_its_owner_even_if_another_truth_is_nearer() -> None:
@@ -54,7 +54,7 @@ def test_a_track_answers_for_its_owner_even_if_another_truth_is_nearer() -> None
     outputs = outputs_at([4.9, 0.1], [0.9, 0.9])
     points = outputs.layers[-1].points
     assert points is not None
-    pairs = owned_truth(owners_of(10, 77), outputs.row_valid, points, targets, SIZE)
+    pairs = truth_of_tracks(owners_of(10, 77), outputs.query_valid, points, targets, SIZE)
     assert (pairs.row.tolist(), pairs.truth.tolist()) == ([0], [0]), "row 1's element is gone: background"
 
 
@@ -63,7 +63,7 @@ def test_of_several_pieces_the_nearest_counts() -> None:
     outputs = outputs_at([4.0], [0.9])
     points = outputs.layers[-1].points
     assert points is not None
-    assert owned_truth(owners_of(10), outputs.row_valid, points, targets, SIZE).truth.tolist() == [1]
+    assert truth_of_tracks(owners_of(10), outputs.query_valid, points, targets, SIZE).truth.tolist() == [1]
 
 
 def test_detections_keep_the_truth_that_tracks_own() -> None:
@@ -89,12 +89,12 @@ def test_a_track_without_owner_is_pushed_towards_background() -> None:
     assert logits.grad[0, 0, 1] > 0 > logits.grad[0, 1, 1]
 
 
-def choose(heights: list[float], scores: list[float], owners: Owners, targets: Targets, settings: StreamSettings):
+def choose(heights: list[float], scores: list[float], owners: TrackTruth, targets: Targets, settings: StreamSettings):
     outputs = outputs_at(heights, scores)
     rows = owners.kinds.shape[1]
     points = outputs.layers[-1].points
     assert points is not None
-    tracks = owned_truth(owners, outputs.row_valid[:, :rows], points[:, :rows], targets, SIZE)
+    tracks = truth_of_tracks(owners, outputs.query_valid[:, :rows], points[:, :rows], targets, SIZE)
     found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts(), tracks, rows)
     return choose_tracks(outputs, rows, owners, found.assignment, targets, settings, np.random.default_rng(0))
 
@@ -105,7 +105,7 @@ def test_scores_choose_and_truth_names_the_owner() -> None:
     chosen = choose([0, 5, 0.1, 5.1, -5], [0.8, 0.2, 0.9, 0.7, 0.1], owners_of(10, 11), targets, CALM)
     assert chosen.rows.tolist() == [[0, 3]]
     assert chosen.identity.tolist() == [[0, -1]]
-    assert chosen.owners.element_ids.tolist() == [[10, 11]]
+    assert chosen.track_truth.element_ids.tolist() == [[10, 11]]
 
 
 def test_a_better_detection_refreshes_its_track() -> None:
@@ -123,11 +123,11 @@ def test_false_tracks_belong_to_nobody_and_stay_so() -> None:
         found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts())
         settings = replace(CALM, false_tracks=1)
         born = choose_tracks(
-            outputs, 0, Owners.none(1), found.assignment, targets, settings, np.random.default_rng(seed)
+            outputs, 0, TrackTruth.none(1), found.assignment, targets, settings, np.random.default_rng(seed)
         )
         if born.rows.shape[1] == 2:
             break
     assert born is not None
-    assert born.owners.element_ids.tolist() == [[10, -1]]
-    later = choose([0.0, 5.0], [0.9, 0.9], born.owners, lines_at(0.0, 5.0), CALM)
-    assert later.owners.element_ids.tolist() == [[10, -1]]
+    assert born.track_truth.element_ids.tolist() == [[10, -1]]
+    later = choose([0.0, 5.0], [0.9, 0.9], born.track_truth, lines_at(0.0, 5.0), CALM)
+    assert later.track_truth.element_ids.tolist() == [[10, -1]]

@@ -1,4 +1,4 @@
-"""What a map decoder starts from, and what every one of them offers."""
+"""Interface of the map decoders: what they start from and what they return."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.network.maptracker.vector_memory import Recalled
+from predmapnet.network.maptracker.vector_memory import RecalledQueries
 
 
 @dataclass
-class DecoderRows:
+class DecoderInput:
     """What the decoder starts from; rows are ``T`` tracks, then ``Q`` detections.
 
     Attributes:
@@ -25,7 +25,7 @@ class DecoderRows:
     queries: Tensor
     points: Tensor
     track_valid: Tensor
-    memory: Recalled | None
+    memory: RecalledQueries | None
     first_frame: Tensor
 
     @property
@@ -35,7 +35,7 @@ class DecoderRows:
         return F.pad(self.track_valid, (0, rows - tracks), value=True)
 
 
-class RowDecoder(nn.Module):
+class MapDecoder(nn.Module):
     """What every map decoder offers: from rows and the finest BEV level to polylines.
 
     Attributes:
@@ -45,7 +45,7 @@ class RowDecoder(nn.Module):
 
     learns_start: bool
 
-    def forward(self, start: DecoderRows, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    def forward(self, start: DecoderInput, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Decode.
 
         Args:

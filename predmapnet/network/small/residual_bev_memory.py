@@ -1,4 +1,4 @@
-"""Past BEV maps as a residual of finished BEV features (MapTracker's BEV memory, lighter)."""
+"""BEV memory of the small network: past maps enter finished BEV features as a residual (lighter than MapTracker's)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from predmapnet.network.layers import Pointwise, zero_init
 from predmapnet.network.state import StreamState
 
 
-class TemporalBevFusion(nn.Module):
+class ResidualBevMemory(nn.Module):
     """Past raw maps, chosen by distance and warped, enter the BEV features as residuals that start as zero.
 
     Raw (unfused) maps are stored, so that nothing is fed back and errors do not accumulate.
@@ -77,7 +77,7 @@ class TemporalBevFusion(nn.Module):
         return chosen, ~repeated & state.bev_memory_valid.any(dim=1, keepdim=True)
 
 
-def remember_bev(
+def store_raw_map(
     state: StreamState, raw: Tensor, ego_to_global: Tensor, spacing: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Store the current raw map; the newest one is replaced until the car has moved ``spacing`` metres past it.
@@ -108,7 +108,7 @@ def remember_bev(
     )
 
 
-def empty_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def empty_bev_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return an empty BEV memory: maps, poses and validity.
 
     The residual fusion has a fixed number of slots, none if it is switched off; the encoder's memory grows.

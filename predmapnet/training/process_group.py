@@ -1,4 +1,4 @@
-"""Several training processes that share every step: on few cores, one thread in each beats threads that spin."""
+"""Training processes that share every step: on few cores, one thread in each beats threads that spin."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import nn
 
 
 @dataclass(frozen=True)
-class Workers:
+class ProcessGroup:
     """One process's view of all of them.
 
     Attributes:

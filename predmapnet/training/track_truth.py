@@ -1,4 +1,4 @@
-"""Whose truth a track answers for, and which rows become the next frame's tracks in training (one-way assignment)."""
+"""True element behind each track, and which rows become the next frame's tracks in training (one-way assignment)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from predmapnet.training.settings import StreamSettings
 
 
 @dataclass
-class Owners:
+class TrackTruth:
     """The true element behind each track row.
 
     Attributes:
@@ -28,18 +28,20 @@ class Owners:
     element_ids: Tensor
 
     @classmethod
-    def none(cls, batch: int, device: torch.device | None = None) -> Owners:
-        """Return the owners of streams without tracks."""
+    def none(cls, batch: int, device: torch.device | None = None) -> TrackTruth:
+        """Return what streams without tracks begin with."""
         return cls(*torch.full((2, batch, 0), -1, device=device))
 
 
-def owned_truth(owners: Owners, track_valid: Tensor, points: Tensor, targets: Targets, size: Tensor) -> Assignment:
+def truth_of_tracks(
+    track_truth: TrackTruth, track_valid: Tensor, points: Tensor, targets: Targets, size: Tensor
+) -> Assignment:
     """Find the truth that each track answers for in this frame.
 
     An element may be cut into several pieces by the ROI; a track answers for the piece that is nearest to it.
 
     Args:
-        owners: of the ``T`` track rows.
+        track_truth: of the ``T`` track rows.
         track_valid: ``(B, T) bool``.
         points: ``(B, T, P, 2)``, where the tracks are, normalised.
         targets: truth of the frame.
@@ -51,11 +53,11 @@ def owned_truth(owners: Owners, track_valid: Tensor, points: Tensor, targets: Ta
     pairs = []
     for frame in range(targets.batch):
         truth = torch.nonzero(targets.frame == frame)[:, 0]
-        rows = torch.nonzero(track_valid[frame] & (owners.element_ids[frame] >= 0))[:, 0]
+        rows = torch.nonzero(track_valid[frame] & (track_truth.element_ids[frame] >= 0))[:, 0]
         if not len(truth) or not len(rows):
             continue
-        same = (owners.kinds[frame, rows, None] == targets.kinds[truth]) & (
-            owners.element_ids[frame, rows, None] == targets.element_ids[truth]
+        same = (track_truth.kinds[frame, rows, None] == targets.kinds[truth]) & (
+            track_truth.element_ids[frame, rows, None] == targets.element_ids[truth]
         )
         rings = targets.kinds[truth] == ElementKind.PED_CROSSING
         distance = curve_cost(points[frame, rows].detach() * size, targets.points[truth] * size, rings)
@@ -74,32 +76,32 @@ class Chosen:
         rows: ``(B, T') int64``, rows of this frame's predictions whose query, points and mask are taken; 0 in padding.
         identity: ``(B, T') int64``, track row whose id is kept, -1 for newborns and padding.
         valid: ``(B, T') bool``.
-        owners: of the chosen rows.
+        track_truth: of the chosen rows.
         truth: ``(B, T') int64``, index of the truth that a row was assigned to in this frame, or -1.
     """
 
     rows: Tensor
     identity: Tensor
     valid: Tensor
-    owners: Owners
+    track_truth: TrackTruth
     truth: Tensor
 
 
 def choose_tracks(
     outputs: FrameOutputs,
     track_rows: int,
-    owners: Owners,
+    track_truth: TrackTruth,
     assignment: Assignment,
     targets: Targets,
     settings: StreamSettings,
     generator: np.random.Generator,
 ) -> Chosen:
-    """Choose the next frame's tracks by the network's own scores; truth only names their owners.
+    """Choose the next frame's tracks by the network's own scores; truth only names what they answer for.
 
     Args:
         outputs: of this frame; rows are tracks, then detections.
         track_rows: number of track rows.
-        owners: of the track rows.
+        track_truth: of the track rows.
         assignment: last layer's pairs, tracks and detections.
         targets: truth of this frame.
         settings: threshold and how often what is dropped or replaced.
@@ -109,7 +111,7 @@ def choose_tracks(
     assert logits is not None, "the last layer must classify"
     device = logits.device
     scores = logits.detach().sigmoid().amax(2).cpu().numpy()
-    valid = outputs.row_valid.cpu().numpy()
+    valid = outputs.query_valid.cpu().numpy()
     truth = np.full(valid.shape, -1)
     frame, row, answer = (index.cpu().numpy() for index in (assignment.frame, assignment.row, assignment.truth))
     truth[frame, row] = answer
@@ -124,7 +126,7 @@ def choose_tracks(
     stream = np.arange(len(streams))[:, None]
     of_truth = np.where(kept, truth[stream, rows], -1)
     of_rows, of_tracks, living, pieces = (torch.from_numpy(v).to(device) for v in (rows, identity, kept, of_truth))
-    return Chosen(of_rows, of_tracks, living, _owners(owners, of_tracks, pieces, targets), pieces)
+    return Chosen(of_rows, of_tracks, living, _truth_of_rows(track_truth, of_tracks, pieces, targets), pieces)
 
 
 def _choose_of_stream(
@@ -163,14 +165,14 @@ def _choose_of_stream(
     return rows, identity
 
 
-def _owners(owners: Owners, identity: Tensor, truth: Tensor, targets: Targets) -> Owners:
-    """A track keeps its owner for life; a newborn belongs to the truth it was assigned to."""
+def _truth_of_rows(track_truth: TrackTruth, identity: Tensor, truth: Tensor, targets: Targets) -> TrackTruth:
+    """A track keeps its element for life; a newborn belongs to the truth it was assigned to."""
     batch, width = identity.shape
     stream = torch.arange(batch, device=identity.device)[:, None]
     result = []
-    for kept, of_truth in ((owners.kinds, targets.kinds), (owners.element_ids, targets.element_ids)):
+    for kept, of_truth in ((track_truth.kinds, targets.kinds), (track_truth.element_ids, targets.element_ids)):
         # One more column and entry stand for "none", so that -1 can be looked up.
         of_track = torch.cat([kept, kept.new_full((batch, 1), -1)], 1)[stream, identity]
         of_birth = torch.cat([of_truth, of_truth.new_full((1,), -1)])[truth]
         result.append(torch.where(identity >= 0, of_track, of_birth).reshape(batch, width))
-    return Owners(result[0], result[1])
+    return TrackTruth(result[0], result[1])

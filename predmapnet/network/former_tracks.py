@@ -1,4 +1,4 @@
-"""What is remembered of the tracks of a frame, found again by track id."""
+"""Memory of the last frame's tracks, found again by track id."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from predmapnet.network.state import Instances, LostTracks, StreamState
 
 
 @dataclass
-class TrackMemory:
+class FormerTracks:
     """Memory of ``T`` former tracks, and which of them the ``T'`` instances of this frame continue.
 
     Attributes:
@@ -29,7 +29,7 @@ class TrackMemory:
     point_history_valid: Tensor
 
 
-def memory_of_tracks(instances: Instances, state: StreamState, warped_history: Tensor | None) -> TrackMemory:
+def find_former_tracks(instances: Instances, state: StreamState, warped_history: Tensor | None) -> FormerTracks:
     """Return the memory of the last frame's tracks.
 
     Args:
@@ -38,7 +38,7 @@ def memory_of_tracks(instances: Instances, state: StreamState, warped_history: T
         warped_history: ``(B, T, H_m, W_m)``, its history maps in this frame's ego frame, or None.
     """
     source, matched = match_tracks(instances, state.instances)
-    return TrackMemory(source, matched, warped_history, state.point_history, state.point_history_valid)
+    return FormerTracks(source, matched, warped_history, state.point_history, state.point_history_valid)
 
 
 def match_tracks(instances: Instances, former: Instances | LostTracks) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,94 @@
+"""Scenes of different cars train together: every frame brings its own cameras."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from painted_scenes import painted_scene, tiny_config
+from tiny_clips import tiny_paper_config
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training.clips import ClipTraining
+from predmapnet.training.data.augmentation import AugmentationSettings
+from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.loop import Trainer
+from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.settings import Budget, ClipSettings, StreamSettings, TrainingSettings, plan_run
+from predmapnet.training.single_frame import SingleFrameStage
+from predmapnet.training.temporal import TemporalStage
+
+UNCHANGED = AugmentationSettings(gain=0.0, colour=0.0, offset=0.0, noise=0.0, camera_dropout=0.0)
+
+
+def other_car():
+    """Three cameras, higher, off the middle, with other focal lengths."""
+    cameras = []
+    for number, camera in enumerate(DEMO_RIG[1:4]):
+        pose = camera.camera_to_ego.copy()
+        pose[:3, 3] += [0.2, 0.3, 0.4 + 0.1 * number]
+        cameras.append(replace(camera, camera_to_ego=pose, intrinsics=camera.intrinsics * [[0.8], [0.8], [1.0]]))
+    return tuple(cameras)
+
+
+def mixed_scenes(folder, config: PredMapNetConfig) -> TrainingScenes:
+    rigs = (DEMO_RIG, other_car(), DEMO_RIG[:1])
+    scenes = [painted_scene(folder / f"scene-{i}", 6, i, config, rig) for i, rig in enumerate(rigs)]
+    return TrainingScenes(scenes, config)
+
+
+def share_painted(batch: Batch, config: PredMapNetConfig) -> list[float]:
+    """Share of the true points, by frame, that the images show where the calibration projects them."""
+    shares = []
+    for number, images in enumerate(batch.images):
+        points = batch.targets.points[batch.targets.frame == number].flatten(0, 1).double().numpy()
+        metres = (points - 0.5) * config.roi.size
+        ground = np.column_stack([metres, np.zeros(len(metres)), np.ones(len(metres))])
+        hits = []
+        for matrix, image in zip(batch.calibration.ego_to_image[number].numpy(), images.numpy(), strict=True):
+            u, v, depth = matrix @ ground.T
+            ahead = depth > 1.0
+            column, row = (u[ahead] / depth[ahead]).astype(int), (v[ahead] / depth[ahead]).astype(int)
+            rows, columns = image.shape[:2]
+            inside = (column > 1) & (column < columns - 2) & (row > 1) & (row < rows - 2)
+            lit = image.max(axis=2) > 0
+            around = [lit[row[inside] + i, column[inside] + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+            hits.append(np.any(around, axis=0))
+        shares.append(float(np.concatenate(hits).mean()))
+    return shares
+
+
+def test_each_frame_of_a_batch_shows_the_truth_where_its_own_cameras_see_it(tmp_path):
+    config = tiny_config()
+    scenes = mixed_scenes(tmp_path, config)
+    batches = SingleFrameBatches(scenes, 8, config.roi, config.decoder.points, UNCHANGED, (0,))
+    cameras = set()
+    for step in range(3):
+        batch = batches(step)
+        assert batch.images.shape[1] == batch.camera_valid.shape[1] == batch.calibration.camera_code.shape[1]
+        cameras |= set(batch.camera_valid.sum(dim=1).tolist())
+        assert min(share_painted(batch, config)) > 0.85
+    assert cameras == {1, 3, 6}
+
+
+@pytest.mark.parametrize("name", ["single", "temporal", "bev", "joint"])
+def test_every_stage_trains_on_cars_of_different_rigs(name, tmp_path):
+    torch.manual_seed(0)
+    lite = name in ("single", "temporal")
+    config = tiny_config() if lite else tiny_paper_config()
+    scenes = mixed_scenes(tmp_path, config)
+    network, processes, quiet = PredMapNet(config), ProcessGroup(), lambda _line: None
+    streams = StreamSettings(streams=3, score=0.03, growth_steps=1, longest=6)
+    settings = TrainingSettings(batch=4, log_steps=1, streams=streams)
+    if name == "single":
+        stage = SingleFrameStage(network, scenes, settings, processes)
+    elif name == "temporal":
+        stage = TemporalStage(network, scenes, settings, tmp_path, processes, quiet)
+    else:
+        settings = replace(plan_run(config, name, 1.0, 2, batch=3), clips=ClipSettings(frames=2, span=3))
+        stage = ClipTraining(settings.clip_stages[0][0], network, scenes, settings, processes)
+    trainer = Trainer(network, settings, tmp_path / "run", processes, quiet)
+    assert trainer.run(stage, Budget(steps=2), settings.optimiser, lambda _network, _stage: {})
+    assert all(torch.isfinite(value).all() for value in network.state_dict().values())
