@@ -94,9 +94,9 @@ def crossing_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
         paths = shapely.STRtree([LineString(path) for path in town.lane_paths])
         for index, shape in enumerate(shapes):
             others = shapes[:index] + shapes[index + 1 :]
-            gap = min((shape.distance(other) for other in others), default=99.0)
+            gap = min((shape.distance(other) for other in others), default=np.inf)
             touching.append(gap < 0.5)
-            gaps.append(gap)
+            gaps += [gap] if others else []
             box = np.asarray(shape.minimum_rotated_rectangle.exterior.coords)
             sides = sorted(np.linalg.norm(np.diff(box[:3], axis=0), axis=1).tolist())
             depths.append(sides[0])
@@ -176,7 +176,7 @@ def lane_row(maps: list[VectorMap]) -> Row:
     weighted = 100 * float(np.average(tight, weights=lengths)) if tight else np.nan
     return {
         "lane width p10/50/90 (deviation), m": f"{percentiles(widths)} ({np.std(widths):.2f})" if widths else "-",
-        "lane paths with a radius under 200 m, %": f"{weighted:.0f}",
+        "lane paths with a radius under 200 m, %": f"{weighted:.0f}" if tight else "-",
     }
 
 
@@ -188,9 +188,9 @@ def street_row(maps: list[VectorMap], roads: list[shapely.Geometry]) -> Row:
         shapely.prepare(road)
         lines = [LineString(path) for path in town.lane_paths]
         tree, lanes = shapely.STRtree(lines), shapely.STRtree(town.lanes)
-        for line, lane in zip(lines, town.lanes, strict=False):
+        for line in lines:
             length += line.length / 1000
-            ends += sum(_narrow(lane, line, at) for at in (1.0, line.length - 1.0) if line.length > 12.0)
+            ends += sum(_narrow(lanes, line, at) for at in (1.0, line.length - 1.0) if line.length > 12.0)
             for at in np.arange(10.0, line.length - 5.0, 20.0):
                 ahead, against, between = _across(line, at, lines, tree)
                 same.append(ahead)
@@ -230,8 +230,11 @@ def _normal(line: LineString, at: float, reach: float) -> tuple[LineString, Floa
     return LineString([here - aside, here + aside]), ahead
 
 
-def _narrow(lane: Polygon, line: LineString, at: float) -> bool:
-    return bool(lane.intersection(_normal(line, at, 4.0)[0]).length < 1.8)
+def _narrow(lanes: shapely.STRtree, line: LineString, at: float) -> bool:
+    """Whether the widest lane that holds a place of a lane path is under 1.8 m wide there; False where none does."""
+    cut = _normal(line, at, 4.0)[0]
+    holding = lanes.geometries[lanes.query(line.interpolate(at), predicate="within")]
+    return bool(len(holding) and shapely.length(shapely.intersection(holding, cut)).max() < 1.8)
 
 
 def _across(

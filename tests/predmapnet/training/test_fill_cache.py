@@ -12,7 +12,7 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.demo_world.rigs import sample_rig
 from predmapnet.network.image_input import ego_to_image
 from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene, read_scene
+from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> CachedScene:
     )
     folder = tmp_path_factory.mktemp("cache") / f"scene-{number:04d}"
     cache_demo_scene(folder, PredMapNetConfig())
-    return read_scene(folder)
+    return read_cached_scene(folder)
 
 
 def _brightness(scene: CachedScene, frame: int, points: np.ndarray) -> np.ndarray:
