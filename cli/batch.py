@@ -13,6 +13,7 @@ from cli.options import (
     DataRoot,
     Dataset,
     Device,
+    Origin,
     PrecisionOption,
     Scheme,
     SplitScheme,
@@ -37,6 +38,7 @@ def batch(
     dataset: Dataset = None,
     data_root: DataRoot = None,
     split_scheme: SplitScheme = Scheme.OLD,
+    origin: Origin = None,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
@@ -49,6 +51,7 @@ def batch(
     scene failed.
     """
     from cli.console import err, progress_display, say_outcomes
+    from predmapnet.datasets.georeference import given_origin
     from predmapnet.runs.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
     from predmapnet.sources import open_source
     from predmapnet.weights.files import weights_hash
@@ -68,6 +71,7 @@ def batch(
         recordings,
         save_frames,
         threads=max(1, available_cores() // jobs),
+        origin=None if origin is None else given_origin(origin),
     )
     journal = BatchJournal(out)
     with progress_display() as display:

@@ -123,6 +123,8 @@ def say_report(report: SceneReport) -> None:
     out.print(report_table(report))
     for line in report_lines(report):
         out.print(line, markup=False)
+    for note in report.notes:
+        say_warning(note)
     for reason, count in report.rejections.items():
         say_warning(f"the integrator rejected {count} x {reason}")
 

@@ -28,7 +28,7 @@ def diff(
     ] = True,
 ) -> None:
     """Compare two maps: what was added, removed or moved, and what the later drive did not see."""
-    from cli.console import err
+    from cli.console import err, say_warning
     from cli.console import out as screen
     from mapfusion.diff import DiffConfig, diff_maps, write_diff
     from mapfusion.formats.by_suffix import read_maps
@@ -36,9 +36,12 @@ def diff(
     from predmapnet.files import check_output
 
     if out is not None:
-        check_output(out)
+        check_output(out, (".geojson", ".json"))
     with value_errors_told():
         (before, after), plane = read_maps([old, new])
+    for path, read in ((old, before), (new, after)):
+        for note in read.notes:
+            say_warning(f"{path}: {note}")
     config = DiffConfig(tolerance=tolerance, reach=max(2.0, 2.0 * tolerance), align=align)
     found = diff_maps(before, after, plane, config)
     err.print(_alignment_sentence(found, align), markup=False)

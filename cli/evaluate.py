@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
+from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,10 +22,15 @@ from cli.options import (
     SplitScheme,
     Weights,
 )
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.machine import NetworkOptions, Precision, available_cores, use_threads
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from mapfusion.elements import RegionOfInterest
+    from predmapnet.evaluation.measurement import Measurement
+    from predmapnet.scenes import SceneSource
 
 KINDS = ("ped_crossing", "divider", "boundary")
 
@@ -32,6 +40,14 @@ class Region(StrEnum):
 
     STANDARD = "60x30"
     WIDE = "100x50"
+
+    @property
+    def region(self) -> RegionOfInterest:
+        """The region itself."""
+        from mapfusion.elements import RegionOfInterest
+
+        length, width = (float(side) for side in self.value.split("x"))
+        return RegionOfInterest(length, width)
 
 
 def evaluate(
@@ -48,24 +64,36 @@ def evaluate(
         Path | None, typer.Option("--json", help="Figures to write (JSON).", show_default=False)
     ] = None,
     report: Annotated[
-        Path | None, typer.Option(help="Report to write (HTML): curves and the worst frames.", show_default=False)
+        Path | None,
+        typer.Option(help="Report to write (HTML): scenes, curves and the worst frames.", show_default=False),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
-    roi: Annotated[Region, typer.Option(help="Region of interest of a submission, metres.")] = Region.STANDARD,
+    roi: Annotated[
+        Region | None,
+        typer.Option(help="Region of a submission, metres; recognised by its elements.", show_default=False),
+    ] = None,
+    stability: Annotated[
+        Protocol,
+        typer.Option(
+            metavar="PROTOCOL",
+            help="Protocol of the stability: anchored (elements of the ground truth), published (the same with the "
+            "public toolbox's defect) or paired (pairs of predictions).",
+        ),
+    ] = Protocol.ANCHORED,
     dataset: Dataset = None,
     data_root: DataRoot = None,
     split_scheme: SplitScheme = Scheme.OLD,
     official_frames: OfficialFrames = False,
-    truth_cache: Annotated[
-        bool, typer.Option("--truth-cache/--no-truth-cache", help="Cache the ground truth on disk.")
-    ] = True,
+    no_truth_cache: Annotated[
+        bool, typer.Option("--no-truth-cache", help="Compute the ground truth anew, without a cache on disk.")
+    ] = False,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
 ) -> None:
     """Measure per-frame maps and maps of whole drives with the metrics of the field."""
-    from cli.console import err, out, progress_display
+    from cli.console import err, out, progress_display, say_warning
     from predmapnet.files import check_output
 
     for path in (json_file, report):
@@ -73,18 +101,13 @@ def evaluate(
             check_output(path)
     threads = max(1, available_cores() // jobs)
     use_threads(threads)
-    from mapfusion.elements import RegionOfInterest
     from predmapnet.demo_world.catalogue import default_cache
-    from predmapnet.errors import UserError
     from predmapnet.evaluation.measurement import pool_scenes
+    from predmapnet.evaluation.recognition import split_of, warnings_of
     from predmapnet.evaluation.report import write_figures, write_report
+    from predmapnet.evaluation.scene_figures import scene_figures
     from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, scenes_to_measure
 
-    if results is not None and not results.exists():
-        raise UserError(f"There is no file or folder {results}.")
-    if roi is not Region.STANDARD and (results is None or results.suffix != ".json"):
-        raise UserError("--roi is for submissions (.json); what is mapped here and our own files know their region.")
-    length, width = (float(side) for side in roi.value.split("x"))
     settings = EvaluationSettings(
         dataset=dataset,
         data_root=data_root,
@@ -92,13 +115,17 @@ def evaluate(
         official_frames=official_frames,
         results=results,
         network=NetworkOptions(weights, device, precision, compiled),
-        roi=RegionOfInterest(length, width),
+        roi=_region(results, roi),
+        protocol=stability,
         threads=threads,
-        cache=default_cache() / "ground-truth" if truth_cache else None,
+        cache=None if no_truth_cache else default_cache() / "ground-truth",
     )
     source, sentence = settings.open()
     err.print(sentence, markup=False)
     scenes = scenes_to_measure(settings, source, split)
+    found_split, in_split = split_of(source.scenes(), scenes)
+    world = "demo" if source.synthetic else source.name
+    warnings = warnings_of(world, split_scheme.value, found_split, len(scenes), in_split)
     measured = []
     with progress_display() as display:
         display.scenes(0, len(scenes))
@@ -106,24 +133,81 @@ def evaluate(
             measured.append(measurement)
             display.scenes(len(measured), len(scenes))
     total = pool_scenes(measured)
-    figures = total.figures()
-    context = {
-        "dataset": source.name,
-        "split": split,
+    context = _context(source, total, found_split, in_split) | {
         "split_scheme": split_scheme.value,
         "official_frames": official_frames,
-        "synthetic": source.synthetic,
-        "scenes": list(total.scenes),
+        "warnings": warnings,
     }
+    figures = total.figures()
+    out.print(_what(context), markup=False)
     out.print(_table(figures))
     for line in _lines(figures):
         out.print(line, markup=False)
+    for text in (*warnings, *total.missing()):
+        say_warning(text)
+    if json_file is None and report is None:
+        return
+    per_scene = {scene.frames[0].scene: scene_figures(scene) for scene in measured}
     if json_file is not None:
-        write_figures(json_file, figures, context)
+        write_figures(json_file, {**figures, "per_scene": per_scene}, context)
         out.print(f"written: {json_file}", markup=False)
     if report is not None:
-        write_report(report, total, context)
+        write_report(report, total, context, per_scene, _origin(results, weights, total))
         out.print(f"written: {report}", markup=False)
+
+
+def _region(results: Path | None, stated: Region | None) -> RegionOfInterest:
+    """Return the region of a submission, stated or recognised; others know theirs."""
+    from mapfusion.elements import RegionOfInterest
+    from predmapnet.errors import UserError
+    from predmapnet.runs.evaluate import submitted_region
+
+    if results is not None and not results.exists():
+        raise UserError(f"There is no file or folder {results}.")
+    submission = results is not None and results.is_file() and results.suffix == ".json"
+    if stated is not None and not submission:
+        raise UserError("--roi is for submissions (.json); what is mapped here and our own files know their region.")
+    if results is None or not submission:
+        return RegionOfInterest()
+    return submitted_region(results, None if stated is None else stated.region)
+
+
+def _context(source: SceneSource, total: Measurement, split: str, in_split: int) -> dict[str, Any]:
+    """Return what was evaluated, as written to JSON under ``evaluated``."""
+    return {
+        "dataset": source.name,
+        "split": split,
+        "scenes_in_split": in_split,
+        "roi_m": [total.roi.length, total.roi.width],
+        "synthetic": source.synthetic,
+        "weights_sha256": total.weights_sha256,
+        "scenes": list(total.scenes),
+        "missing": total.missing(),
+    }
+
+
+def _what(context: dict[str, Any]) -> str:
+    """Return the line above the table: what the figures are of."""
+    length, width = context["roi_m"]
+    return (
+        f"{context['dataset']}, split {context['split']} ({context['split_scheme']}): {len(context['scenes'])} of "
+        f"{context['scenes_in_split']} scenes, {length:g} m x {width:g} m"
+    )
+
+
+def _origin(results: Path | None, weights: Path | None, total: Measurement) -> dict[str, str]:
+    """Return what the report says of its making: date, weights and command."""
+    name = "the shipped ones" if weights is None else weights.name
+    known = total.weights_sha256
+    if results is not None:
+        made = f"of {results.name}, SHA-256 {known[:12]}" if known else f"not known; results of {results.name}"
+    else:
+        made = f"{name}, SHA-256 {(known or '')[:12]}"
+    return {
+        "date": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
+        "weights": made,
+        "command": shlex.join(["predmapnet", *sys.argv[1:]]),
+    }
 
 
 def _table(figures: dict[str, Any]) -> Table:
@@ -139,26 +223,28 @@ def _table(figures: dict[str, Any]) -> Table:
     table.add_column("")
     for heading in ("all", *KINDS):
         table.add_column(heading, justify="right")
-    chamfer, raster, consistency = figures["chamfer_ap"], figures["raster_ap"], figures["consistency_ap"]
-    _add(table, "chamfer AP", chamfer["mAP"], [chamfer[kind]["AP"] for kind in KINDS])
+    chamfer, consistency = figures["chamfer_ap"], figures["consistency_ap"]
+    _add_precisions(table, "chamfer AP", chamfer)
     for name in [key for key in chamfer["divider"] if key.startswith("AP@")]:
         _add(table, f"  {name[2:]} m", None, [chamfer[kind][name] for kind in KINDS])
-    _add(table, "rasterisation AP", raster["mAP"], [raster[kind]["AP"] for kind in KINDS])
-    _add(
-        table,
-        f"consistency AP ({consistency['ids']} ids)",
-        consistency["mAP"],
-        [consistency[kind]["AP"] for kind in KINDS],
-    )
+    _add_precisions(table, "  ahead of the car", figures["ahead_ap"])
+    _add_precisions(table, "  behind the car", figures["rear_ap"])
+    _add_precisions(table, "order-aware AP (Frechet)", figures["frechet_ap"])
+    _add_precisions(table, "rasterisation AP", figures["raster_ap"])
+    _add_precisions(table, f"consistency AP ({consistency['ids']} ids)", consistency)
     if consistency["ids"] == "tracker":
-        formed = figures["consistency_ap_formed_ids"]
-        _add(table, "consistency AP (formed ids)", formed["mAP"], [formed[kind]["AP"] for kind in KINDS])
+        _add_precisions(table, "consistency AP (formed ids)", figures["consistency_ap_formed_ids"])
+    stable = figures["stability"]
+    _add(table, f"stability mAS ({stable['protocol']})", stable["mAS"], [stable[kind]["stability"] for kind in KINDS])
+    for value in ("presence", "localisation", "shape"):
+        _add(table, f"  {value}", stable[value], [stable[kind][value] for kind in KINDS])
     whole = figures["global_map"]
     if whole is not None:
         table.add_section()
         for key, text, digits in _GLOBAL_ROWS:
             _add(table, text, whole[key], [whole[kind][key] for kind in KINDS], digits)
         _add(table, "map element AP", whole["element_mAP"], [whole[kind]["element_AP"] for kind in KINDS])
+        _add_precisions(table, "global AP (GlobalMapNet)", figures["global_map_ap"])
     return table
 
 
@@ -177,6 +263,10 @@ _GLOBAL_ROWS = (
 
 def _add(table: Table, text: str, overall: float | None, values: list[float | None], digits: int = 3) -> None:
     table.add_row(text, *("" if value is None else f"{value:.{digits}f}" for value in (overall, *values)))
+
+
+def _add_precisions(table: Table, text: str, section: dict[str, Any]) -> None:
+    _add(table, text, section["mAP"], [section[kind]["AP"] for kind in KINDS])
 
 
 def _lines(figures: dict[str, Any]) -> list[str]:

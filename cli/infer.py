@@ -7,7 +7,17 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
+from cli.options import (
+    AllowMissingCameras,
+    Compile,
+    DataRoot,
+    Dataset,
+    Device,
+    Origin,
+    PrecisionOption,
+    Threads,
+    Weights,
+)
 from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
@@ -18,6 +28,7 @@ def infer(
     save_frames: Annotated[Path | None, typer.Option(help="Per-frame results to write (.parquet).")] = None,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    origin: Origin = None,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
@@ -27,15 +38,17 @@ def infer(
 ) -> None:
     """Map one scene: driving log in, global vector map out."""
     from cli.console import err, progress_display, say_report, warn_of_weights
+    from predmapnet.datasets.georeference import given_origin
     from predmapnet.runs.outputs import Outputs
 
     outputs = Outputs(out, recording, save_frames)
     outputs.check()
+    frame_origin = None if origin is None else given_origin(origin)
     use_threads(threads)
     from predmapnet.runs.infer import MappingPipeline
 
     network = NetworkOptions(weights, device, precision, compiled)
-    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras)
+    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, frame_origin)
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)
     with progress_display() as display:

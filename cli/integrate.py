@@ -16,7 +16,7 @@ def integrate(
     frames: Annotated[
         Path,
         typer.Argument(
-            help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR and the like."
+            help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR, HDMapNet and kin."
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
@@ -40,6 +40,9 @@ def integrate(
     y_forward: Annotated[
         bool, typer.Option("--y-forward", help="The results' x points right and y forward (MapTR on nuScenes).")
     ] = False,
+    normalised: Annotated[
+        bool, typer.Option("--normalised", help="The results' points are shares (0 to 1) of the region's sides.")
+    ] = False,
 ) -> None:
     """Fuse the per-frame results of any detector into one map."""
     from cli.console import out as screen
@@ -56,7 +59,7 @@ def integrate(
     region = _region(roi)
     if location is not None or origin is not None:
         _georeference(location, origin)  # a wrong option is reported before the work begins
-    done = integrate_file(frames, poses, region, min_score, y_forward)
+    done = integrate_file(frames, poses, region, min_score, y_forward, normalised)
     synthetic = done.synthetic and location is None
     georeference = _georeference(location or (None if origin else done.location), origin, synthetic)
     provenance: dict[str, Any] = {
@@ -93,20 +96,16 @@ def _region(text: str) -> RegionOfInterest:
 
 
 def _georeference(location: str | None, origin: str | None, synthetic: bool = False) -> Georeference:
-    from mapfusion.formats.local_plane import LocalPlane
-    from predmapnet.datasets.georeference import ARGOVERSE2_CITIES, NUSCENES_ORIGINS, georeference_of
+    from predmapnet.datasets.georeference import (
+        ARGOVERSE2_CITIES,
+        NUSCENES_ORIGINS,
+        georeference_of,
+        given_origin,
+    )
     from predmapnet.errors import UserError
 
     if origin is not None:
-        try:
-            latitude, longitude = (float(number) for number in origin.split(","))
-        except ValueError as error:
-            raise UserError(
-                f"--origin {origin}: latitude,longitude in degrees are expected, as in 49.01,8.41"
-            ) from error
-        if not (abs(latitude) < 85 and abs(longitude) <= 180):
-            raise UserError(f"--origin {origin} does not lie on Earth; latitude comes first")
-        return LocalPlane(longitude, latitude, "given origin")
+        return given_origin(origin)
     found = georeference_of(location or "", synthetic)
     if found is None:
         known = ", ".join([*NUSCENES_ORIGINS, *ARGOVERSE2_CITIES])

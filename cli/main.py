@@ -14,6 +14,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from cli.batch import batch
+from cli.compare import compare
 from cli.console import say_error
 from cli.diff import diff
 from cli.evaluate import evaluate
@@ -40,6 +41,7 @@ app.command()(view)
 app.command()(batch)
 app.command()(scenes)
 app.command()(evaluate)
+app.command()(compare)
 app.command()(train)
 app.add_typer(weights)
 app.command()(integrate)

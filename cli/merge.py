@@ -45,6 +45,8 @@ def merge(
         if status.note:
             kept = "kept apart, its elements are in the map as they are" if status.apart else "merged as it lies"
             say_warning(f"{status.name}: {kept}: {status.note}")
+    for name, note in report.notes:
+        say_warning(f"{name}: {note}")
     for name in report.duplicates:
         say_warning(f"{name} is the same as another map and counts once")
     written = [out, *(write_styles(out) if style else ())]

@@ -56,6 +56,14 @@ Compile = Annotated[
     ),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
+Origin = Annotated[
+    str | None,
+    typer.Option(
+        help="Place on Earth of the origin of the poses (x east, y north): latitude,longitude, as in 49.01,8.41. "
+        "Default: the data set's, or a local frame.",
+        show_default=False,
+    ),
+]
 AllowMissingCameras = Annotated[
     bool,
     typer.Option("--allow-missing-cameras", help="Map frames without the images of some cameras, instead of stopping."),

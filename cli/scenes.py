@@ -35,6 +35,6 @@ def scenes(
     err.print(sentence, markup=False)
     table = Table("scene", "split", "frames", "location", "ready", "", show_edge=False, pad_edge=False)
     for scene in found:
-        ready = "yes" if scene.ready else "made when used"
+        ready = "yes" if scene.ready else "made when used" if source.synthetic else "no"
         table.add_row(scene.name, scene.split, str(scene.frames), scene.location, ready, scene.description)
     out.print(table)

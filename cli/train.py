@@ -66,7 +66,7 @@ def train(
         f"Training '{preset}' on {towns} scenes of '{data}' for {minutes:g} minutes (stage {stage}) "
         f"with {processes} x {threads} threads. Everything goes to {out}."
     )
-    weights = run.train(options, typer.echo)
+    weights = run.train_network(options, typer.echo)
     if weights is None:
         typer.echo(f"Stopped. Go on with: predmapnet train --out {out} --resume (and the same options)")
         raise typer.Exit(130)

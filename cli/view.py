@@ -12,7 +12,9 @@ from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
 def view(
-    what: Annotated[str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson).")],
+    what: Annotated[
+        str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb or .osm).")
+    ],
     web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
     port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
     out: Annotated[
@@ -33,12 +35,14 @@ def view(
     """
     from cli.console import err, progress_display, say_report, warn_of_weights
     from cli.viewer import Viewer
+    from mapfusion.formats.by_suffix import SUFFIXES
     from predmapnet.runs.outputs import Outputs
 
-    if what.endswith(".rrd"):
+    ending = Path(what).suffix.lower()
+    if ending == ".rrd":
         Viewer.show_file(Path(what), web, port)
         return
-    is_map = what.endswith((".geojson", ".json"))
+    is_map = ending in SUFFIXES
     with Viewer.open(Path(what).stem, web, port, out, live=not is_map) as viewer:
         if is_map:
             from predmapnet.recording import log_map_file

@@ -190,10 +190,17 @@ def united_origins(several: Iterable[Origins]) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class GlobalMap:
-    """Map of one or more drives: elements in one metric global frame, and their provenance."""
+    """Map of one or more drives: elements in one metric global frame, and their provenance.
+
+    Attributes:
+        elements: of the map.
+        provenance: its origin, as files keep it.
+        notes: of the reader of a file: what was repaired, supplied or left out, for the user.
+    """
 
     elements: tuple[MapElement, ...]
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.elements)
@@ -208,7 +215,7 @@ class GlobalMap:
     def moved(self, motion: Callable[[Float], Float]) -> GlobalMap:
         """Return the map with a motion of points ``(n, 2)`` applied to all elements."""
         elements = tuple(replace(element, points=motion(element.points)) for element in self)
-        return GlobalMap(elements, self.provenance)
+        return GlobalMap(elements, self.provenance, self.notes)
 
     def length(self, kind: ElementKind) -> float:
         """Total length of one kind, metres."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 from collections.abc import Iterator
@@ -20,13 +21,35 @@ def write_whole(path: Path) -> Iterator[Path]:
         path: file to write; its folder exists, and a file that is there already is replaced.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: the file cannot be written, or another program has it open.
     """
+    if path.is_symlink():  # the link stays one, and the file that it names is written
+        path = path.resolve()
+    _refuse_open_file(path)
     temporary = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
+        _refuse_open_file(path)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def companion_of_open_file(path: Path) -> Path | None:
+    """Return the file beside ``path`` that tells that another program has it open; None if there is none.
+
+    A program that has a GeoPackage open keeps changes in ``-wal`` or ``-journal`` beside it. SQLite would apply them to
+    whatever file has that name, so a new one must not take its place. Locks of other programs count, too.
+    """
+    beside = [Path(f"{path}{ending}") for ending in ("-wal", "-journal", "-shm")]
+    locks = [path.with_name(f".~lock.{path.name}#"), Path(f"{path}.lock"), path.with_name(f".{path.name}.lock")]
+    full = (companion for companion in beside if companion.is_file() and companion.stat().st_size > 0)
+    return next(full, None) or next((lock for lock in locks if lock.exists() or lock.is_symlink()), None)
+
+
+def _refuse_open_file(path: Path) -> None:
+    companion = companion_of_open_file(path)
+    if companion is not None:
+        raise OSError(errno.EBUSY, f"another program has it open ({companion} is there); close it there", str(path))

@@ -4,7 +4,27 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+
 from mapfusion.arrays import Float
+
+FARTHEST = 100_000.0
+"""Farthest that a point may lie from the origin of a local frame, metres: beyond, its lengths are not true."""
+
+
+def check_reach(points: Float, name: str) -> None:
+    """Check that ``(n, 2)`` points, metres, lie within 100 km of the origin of the frame ``name``.
+
+    Raises:
+        ValueError: they do not; such a frame is not what the points are in.
+    """
+    if len(points) and float(np.abs(points).max()) > FARTHEST:
+        farthest = points[int(np.abs(points).max(axis=1).argmax())]
+        raise ValueError(
+            f"a point lies {np.hypot(*farthest) / 1000:.0f} km from the origin of its frame ({name}), at "
+            f"{farthest[0]:.0f} m, {farthest[1]:.0f} m; within {FARTHEST / 1000:.0f} km its place is true. Are the "
+            "coordinates those of another frame (UTM, for example), or is the origin another?"
+        )
 
 
 class Georeference(Protocol):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,12 +13,19 @@ import mapfusion.files
 from predmapnet.errors import UserError
 
 
-def check_output(path: Path) -> None:
+def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
     """Check before the work begins that a file can be written at ``path``.
 
+    Args:
+        path: of the file.
+        endings: those that the name may have, in lower case; all without.
+
     Raises:
-        UserError: the folder does not exist or cannot be written to, or ``path`` is a folder itself.
+        UserError: the folder does not exist or cannot be written to, ``path`` is a folder itself, or another program
+            has it open.
     """
+    if endings and path.suffix.lower() not in endings:
+        raise UserError(f"cannot write {path}: only {' or '.join(endings)} can be written there, not '{path.suffix}'")
     if path.is_dir():
         raise UserError(f"cannot write to {path}: it is a folder; name a file, for example {path / 'map.geojson'}")
     folder = path.absolute().parent
@@ -24,6 +33,12 @@ def check_output(path: Path) -> None:
         raise UserError(f"cannot write {path.name}: the folder {folder} does not exist; create it or choose another")
     if not folder.is_dir():
         raise UserError(f"cannot write {path.name}: {folder} is a file, not a folder")
+    companion = mapfusion.files.companion_of_open_file(path.resolve() if path.is_symlink() else path)
+    if companion is not None:
+        raise UserError(
+            f"cannot write {path}: another program (QGIS, for example) has it open, since {companion} is there. Close "
+            f"it there, or choose another name; if no program has it open, delete {companion.name} first"
+        )
     with write_errors_told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
         trial.write(b" ")
 
@@ -42,3 +57,16 @@ def write_errors_told(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from error
+
+
+def file_name(name: str) -> str:
+    """Return a name that data brings (of a scene, for example) as one that is safe for a file.
+
+    Names of letters, digits, blanks and ``._+@()-`` stay as they are, unless they begin with a dot or are longer than
+    150 characters. In others, what is not safe becomes ``_``, and a digest keeps different names apart.
+    """
+    safe = re.sub(r"[^\w .+@()-]", "_", name)
+    safe = re.sub(r"^[. ]+|[. ]+$", "_", safe)[:150] or "_"
+    if safe == name:
+        return name
+    return f"{safe}-{hashlib.sha256(name.encode(errors='surrogatepass')).hexdigest()[:8]}"

@@ -119,7 +119,7 @@ class Mapper:
             path = frame.images.get(camera.name)
             if path is None or not path.exists():
                 if not allow_missing_cameras:
-                    raise UserError(_missing_camera(frame, camera.name, path))
+                    raise UserError(_missing_camera(frame, camera.name, path or frame.missing.get(camera.name)))
                 continue
             images[camera.name] = _of_size(read_image(path), camera.width, camera.height, path)
         if not images:

@@ -104,7 +104,8 @@ def map_scene(
         allow_missing_cameras: go on where a camera has no image; otherwise that is an error.
 
     Raises:
-        UserError: there are no frames, an image is damaged or missing, or a pose is broken; the message says which.
+        UserError: there are no frames, most of them cannot be used, an image is damaged or missing, or a pose is
+            broken; the message says which.
     """
     if len(scene) == 0:
         raise UserError(f"{scene.info.name} has no frames: there is nothing to map.")
@@ -121,6 +122,7 @@ def map_scene(
             fused.append(frame_maps[-1])
         for observer in observers:
             observer.observe(step, integrator.map)
+    check_left_out(len(frames), len(fused), integrator.rejections)
     global_map = integrator.map()
     seconds = perf_counter() - start
     for observer in observers:
@@ -130,6 +132,16 @@ def map_scene(
     return SceneRun(
         global_map, tuple(frames), tuple(frame_maps), seconds, means, rejections, observed=seen_along(fused)
     )
+
+
+def check_left_out(frames: int, fused: int, rejections: Mapping[str, int]) -> None:
+    """Raise UserError if the integrator left out most frames: a map of the rest would pass for one of all."""
+    if 2 * fused < frames:
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in rejections.items())
+        raise UserError(
+            f"{frames - fused} of {frames} frames cannot be used, so there is no map: {reasons}. Are the times in "
+            "nanoseconds (microseconds in nuScenes' tables), and the poses in metres?"
+        )
 
 
 def stream(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -85,6 +85,7 @@ class Frame:
             official vector-map data sets.
         rig: the cameras of the car, always all of them.
         images: image files by camera name. A camera without an image is absent.
+        missing: files that the data set names but that are not there, by camera name.
     """
 
     scene: str
@@ -94,6 +95,7 @@ class Frame:
     ego_to_global: Float
     rig: Rig
     images: Mapping[str, Path]
+    missing: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

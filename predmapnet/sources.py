@@ -14,7 +14,8 @@ from pathlib import Path
 
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.argoverse2_files import find_logs
-from predmapnet.datasets.nuscenes import NuScenesSource, find_versions
+from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.datasets.nuscenes_tables import find_versions
 from predmapnet.datasets.splits import check_scheme
 from predmapnet.demo_world.source import DemoSource
 from predmapnet.errors import UserError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,6 +27,9 @@ SUFFIXES = {
     ".osm": "Lanelet2",
 }
 """Endings of the files that hold maps, and the format of each."""
+
+LOCAL_FRAME = "local_frame"
+"""Key of the provenance that names a frame whose place on Earth is not known."""
 
 _WRITERS = {"GeoPackage": write_geodatabase, "FlatGeobuf": write_geodatabase, "Lanelet2": write_lanelet}
 _READERS = {"GeoPackage": read_geodatabase, "FlatGeobuf": read_geodatabase, "Lanelet2": read_lanelet}
@@ -103,7 +106,9 @@ class MapWriter:
 
 
 def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
-    """Read a map that :func:`write_map` wrote.
+    """Read a map that :func:`write_map` wrote, also after another program or a person has edited it.
+
+    ``notes`` of the map tell what was repaired, supplied or left out.
 
     Args:
         path: the file.
@@ -127,7 +132,32 @@ def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
     """
     boxes = [box for box in (read_box(path) for path in paths) if box is not None]
     plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
-    return [read_map(path, plane) for path in paths], plane
+    maps = [read_map(path, plane) for path in paths]
+    check_frames((path.name, frame_of(read)) for path, read in zip(paths, maps, strict=True))
+    return maps, plane
+
+
+def frame_of(global_map: GlobalMap) -> str:
+    """Return the name of a map's local frame, whose place on Earth is not known; empty for a map that lies on Earth."""
+    return str(global_map.provenance.get(LOCAL_FRAME) or "")
+
+
+def check_frames(maps: Iterable[tuple[str, str]]) -> None:
+    """Refuse maps of different local frames, which only seem to lie at one place.
+
+    Args:
+        maps: names of the maps, and of their frames (:func:`frame_of`).
+
+    Raises:
+        ValueError: their places on Earth are not known, and their frames are not the same.
+    """
+    frames = {frame: name for name, frame in maps}
+    if len(frames) > 1:
+        (first, one), (second, other) = list(frames.items())[:2]
+        raise ValueError(
+            f"{one} and {other} do not lie in one frame ({first or 'on Earth'}; {second or 'on Earth'}): map the logs "
+            "again and say with --origin where their frames lie"
+        )
 
 
 def read_box(path: Path) -> Float | None:
@@ -142,17 +172,23 @@ def read_box(path: Path) -> Float | None:
         case "Lanelet2":
             box = _box_of_points(path)
         case _:
-            with path.open(encoding="utf-8") as file:
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
                 head = file.read(512)
             found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
             box = json.loads(found[1]) if found else _box_of_points(path)
     if box is None:
         return None
-    if len(box) != 4 or not np.isfinite(box).all():
+    if len(box) == 6:  # with heights
+        box = [*box[:2], *box[3:5]]
+    try:
+        numbers = np.array(box, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != (4,) or not np.isfinite(numbers).all():
         raise ValueError(f"{path}: the bounding box is not four numbers: {box}")
-    if not (np.abs(box) <= [180.0, 90.0, 180.0, 90.0]).all():
+    if not (np.abs(numbers) <= [180.0, 90.0, 180.0, 90.0]).all():
         raise ValueError(f"{path}: the positions are not longitude and latitude in degrees (WGS84): {box}")
-    return np.array(box, dtype=np.float64)
+    return numbers
 
 
 def _box_of_points(path: Path) -> list[float] | None:

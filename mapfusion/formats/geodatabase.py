@@ -8,7 +8,10 @@ like) and the provenance (metadata ``predmapnet``) are JSON texts. ``number`` ke
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,11 @@ import shapely.geometry
 
 from mapfusion.elements import GlobalMap
 from mapfusion.files import write_whole
-from mapfusion.formats.geojson import elements_of, feature_of, origin_of
+from mapfusion.formats.features import Feature, map_of
+from mapfusion.formats.foreign_values import number_of
+from mapfusion.formats.geojson import feature_of, origin_of
+from mapfusion.formats.reading_notes import ReadingNotes
+from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 LINES, CROSSINGS = "lines", "crossings"
@@ -40,50 +47,56 @@ def write_geodatabase(
     features = [feature_of(element, georeference) for element in global_map]
     origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     rows = list(enumerate(features))
-    with write_whole(path) as temporary:
+    with write_whole(path) as temporary, _plain_folder(temporary) as plain:
         try:
             if path.suffix.lower() == ".fgb":
-                _write_layer(temporary, "FlatGeobuf", path.stem, "Unknown", rows, origin)
+                _write_layer(plain, "FlatGeobuf", path.stem, "Unknown", rows, origin)
                 return
             crossings = [row for row in rows if row[1]["geometry"]["type"] == "Polygon"]
             lines = [row for row in rows if row[1]["geometry"]["type"] == "LineString"]
-            _write_layer(temporary, "GPKG", LINES, "LineString", lines, origin)
-            _write_layer(temporary, "GPKG", CROSSINGS, "Polygon", crossings, origin)
+            _write_layer(plain, "GPKG", LINES, "LineString", lines, origin)
+            _write_layer(plain, "GPKG", CROSSINGS, "Polygon", crossings, origin)
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise OSError(f"cannot write {path}: {error}") from error
 
 
 def read_geodatabase(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
-    """Read a map that :func:`write_geodatabase` wrote; see :func:`mapfusion.formats.geojson.read_geojson`.
+    """Read a map that :func:`write_geodatabase` wrote, also after another program or a person has edited it.
+
+    Layers of any reference system are read; those that are no map (styles, points) are left out, ``notes`` say so.
+    Arguments and result are those of :func:`mapfusion.formats.geojson.read_geojson`.
 
     Raises:
-        ValueError: not a file of ours; says where it breaks.
+        ValueError: no map; says where it breaks.
         OSError: the file cannot be read.
     """
-    numbered: list[tuple[int, dict[str, Any]]] = []
-    origin: dict[str, Any] = {}
-    boxes = []
-    for layer in _layers(path):
-        rows, told, box = _read_layer(path, layer)
-        numbered.extend(rows)
-        origin = told or origin
-        boxes.extend([box] if rows and box is not None else [])
+    numbered: list[tuple[float, Feature]] = []
+    origin: Any = None
+    notes = ReadingNotes()
+    with plain_path(path) as plain, driver_errors_told(path):
+        for layer in _layers(plain, path, notes):
+            rows, told = _read_layer(plain, path, layer)
+            numbered.extend(rows)
+            origin = origin or told
     features = [feature for _, feature in sorted(numbered, key=lambda row: row[0])]
-    table = np.array(boxes, dtype=np.float64).reshape(-1, 4)
-    bounds = [*table[:, :2].min(axis=0), *table[:, 2:].max(axis=0)] if len(table) else None
-    return GlobalMap(elements_of(features, georeference, bounds, path), origin)
+    return map_of(features, origin, path, georeference, notes)
 
 
 def geodatabase_box(path: Path) -> list[float] | None:
     """Return west, south, east and north of a file, degrees, from its header or index; None if it is empty."""
     import pyogrio
 
-    infos = [pyogrio.read_info(path, layer=layer, force_total_bounds=True) for layer in _layers(path)]
-    known = [info["total_bounds"] for info in infos if info["features"] and info["total_bounds"] is not None]
-    boxes = np.array(known, dtype=np.float64).reshape(-1, 4)
-    if not len(boxes):
+    boxes = []
+    with plain_path(path) as plain, driver_errors_told(path):
+        for layer in _layers(plain, path, ReadingNotes()):
+            info = pyogrio.read_info(plain, layer=layer, force_total_bounds=True)
+            bounds = info["total_bounds"]
+            if info["features"] and bounds is not None and np.isfinite(bounds).all():
+                boxes.append(ToDegrees(str(info["crs"] or ""), f"{path}, layer {layer}").box(bounds))
+    if not boxes:
         return None
-    return [*boxes[:, :2].min(axis=0).tolist(), *boxes[:, 2:].max(axis=0).tolist()]
+    table = np.array(boxes, dtype=np.float64)
+    return [*table[:, :2].min(axis=0).tolist(), *table[:, 2:].max(axis=0).tolist()]
 
 
 def _write_layer(
@@ -124,43 +137,91 @@ def _write_layer(
     )
 
 
-def _layers(path: Path) -> list[str]:
+def _layers(plain: Path, path: Path, notes: ReadingNotes) -> list[str]:
+    """Return the layers that hold a map; raises ValueError if there is none."""
     import pyogrio
+
+    found: list[str] = []
+    others: list[str] = []
+    for name, geometry in pyogrio.list_layers(plain):
+        if geometry is None:  # a table without geometries: styles of QGIS and the like
+            continue
+        fields = set(pyogrio.read_info(plain, layer=name)["fields"])
+        (found if "kind" in fields else others).append(str(name))
+    if not found:
+        raise ValueError(f"{path}: not a map of ours: no layer has the column 'kind' (layers: {', '.join(others)})")
+    for name in others:
+        notes.add(f"the layer {name} has no column 'kind': left out")
+    return found
+
+
+def _read_layer(plain: Path, path: Path, layer: str) -> tuple[list[tuple[float, Feature]], Any]:
+    """Return the numbered features of a layer, and the provenance."""
+    import pyogrio
+    from pyogrio import raw
+
+    info = pyogrio.read_info(plain, layer=layer)
+    meta, _, geometry, values = raw.read(plain, layer=layer)
+    to_degrees = ToDegrees(str(info["crs"] or ""), f"{path}, layer {layer}") if len(geometry) else _WGS84
+    columns = dict(zip(meta["fields"].tolist(), values, strict=True))
+    numbers = columns.pop("number", np.full(len(geometry), np.nan))
+    rows = []
+    for place, shape in enumerate(shapely.from_wkb(geometry)):
+        content = {
+            "geometry": None if shape is None else shapely.geometry.mapping(shape),
+            "properties": {name: column[place] for name, column in columns.items()},
+        }
+        number = number_of(numbers[place])
+        rows.append((np.inf if number is None else number, Feature(content, to_degrees)))
+    try:
+        told = json.loads((info.get("layer_metadata") or {}).get(METADATA, "null"))
+    except ValueError:
+        told = None
+    return rows, told
+
+
+_WGS84 = ToDegrees("EPSG:4326", "")
+
+
+@contextmanager
+def driver_errors_told(path: Path) -> Iterator[None]:
+    """Raise what GDAL and GEOS cannot read as ValueErrors that name the file."""
     import pyogrio.errors
 
     if not path.is_file():
         raise FileNotFoundError(2, "No such file or directory", str(path))
     try:
-        return [str(name) for name in pyogrio.list_layers(path)[:, 0]]
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
+        yield
+    except (
+        pyogrio.errors.DataSourceError,
+        pyogrio.errors.DataLayerError,
+        pyogrio.errors.FeatureError,
+        pyogrio.errors.FieldError,
+        shapely.GEOSException,
+        UnicodeDecodeError,
+    ) as error:
         raise ValueError(f"{path}: cannot be read as a map: {error}") from error
 
 
-def _read_layer(path: Path, layer: str) -> tuple[list[tuple[int, dict[str, Any]]], dict[str, Any], Any]:
-    """Return numbered features, the provenance and the bounds of a layer."""
-    import pyogrio
-    import pyogrio.errors
-    from pyogrio import raw
+@contextmanager
+def plain_path(path: Path) -> Iterator[Path]:
+    """Yield a path to the same file that pyogrio takes as it is: it cuts names at ``!``, ``;`` and ``?``."""
+    if not re.search(r"[!;?]|\.zip$", str(path)):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / f"map{path.suffix}"
+        link.symlink_to(path.resolve())
+        yield link
 
-    try:
-        info = pyogrio.read_info(path, layer=layer, force_total_bounds=True)
-        meta, _, geometry, values = raw.read(path, layer=layer)
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
-        raise ValueError(f"{path}: layer {layer} cannot be read: {error}") from error
-    columns = dict(zip(meta["fields"].tolist(), values, strict=True))
-    missing = sorted({"number", "kind", "confidence", "observations", "first_seen", "last_seen"} - set(columns))
-    if missing:
-        raise ValueError(f"{path}: layer {layer} is not a map of ours: it lacks the columns {', '.join(missing)}")
-    shapes = shapely.from_wkb(geometry)
-    rows = []
-    for place, shape in enumerate(shapes):
-        properties = {name: column[place] for name, column in columns.items()}
-        for name in LISTS:
-            text = properties.pop(name, None)
-            if isinstance(text, str):
-                properties[name] = json.loads(text)
-        properties.setdefault("track_ids", [])
-        number = int(properties.pop("number"))
-        rows.append((number, {"geometry": shapely.geometry.mapping(shape), "properties": properties}))
-    told = json.loads((info.get("layer_metadata") or {}).get(METADATA, "{}"))
-    return rows, told, info["total_bounds"]
+
+@contextmanager
+def _plain_folder(path: Path) -> Iterator[Path]:
+    """Yield a path to a file that is yet to be written, as :func:`plain_path` does for one that is there."""
+    if not re.search(r"[!;?]", str(path)):
+        yield path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        link = Path(folder) / "folder"
+        link.symlink_to(path.parent.resolve(), target_is_directory=True)
+        yield link / path.name

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,13 +17,14 @@ import numpy as np
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
-from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.formats.features import Feature, map_of
+from mapfusion.formats.foreign_values import format_timestamp
+from mapfusion.formats.reading_notes import ReadingNotes
+from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 DECIMALS = 10
 """Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""
-
-EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def write_geojson(
@@ -112,66 +112,40 @@ def origin_of(provenance: Mapping[str, Any], georeference: Georeference) -> dict
 
 
 def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
-    """Read a map that :func:`write_geojson` wrote.
+    """Read a map that :func:`write_geojson` wrote, also after another program or a person has edited it.
 
     Args:
         path: the file.
         georeference: leads back to the metric global frame; without one, the map is in metres east and north of
-            the middle of the file's bounding box.
+            the middle of its bounds.
 
     Returns:
-        The map; ``provenance`` is the file's ``predmapnet`` member.
+        The map; ``provenance`` is the file's ``predmapnet`` member, ``notes`` tell what was repaired or left out.
 
     Raises:
-        ValueError: not a file of ours; says where it breaks.
+        ValueError: no map; says where it breaks.
         OSError: the file cannot be read.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise ValueError(f"{path}: not a GeoJSON FeatureCollection")
-    elements = elements_of(document.get("features", []), georeference, document.get("bbox"), path)
-    return GlobalMap(elements, document.get("predmapnet", {}))
+    features = document.get("features")
+    if not isinstance(features, list):
+        raise ValueError(f"{path}: not a GeoJSON FeatureCollection: its member 'features' is not a list")
+    to_degrees = ToDegrees(_reference_system(document.get("crs")), str(path))
+    stored = (Feature(feature, to_degrees) for feature in features)
+    return map_of(stored, document.get("predmapnet"), path, georeference, ReadingNotes())
 
 
-def elements_of(
-    features: Iterable[Mapping[str, Any]],
-    georeference: InvertibleGeoreference | None,
-    box: Sequence[float] | None,
-    path: Path,
-) -> tuple[MapElement, ...]:
-    """Return the elements of features; without a georeference in metres about the middle of ``box`` (degrees).
-
-    Raises:
-        ValueError: a feature is not an element; says which, and in which file.
-    """
-    if georeference is None:
-        west, south, east, north = box or (0.0, 0.0, 0.0, 0.0)
-        georeference = LocalPlane((west + east) / 2, (south + north) / 2)
-    elements = []
-    for position, feature in enumerate(features):
-        try:
-            elements.append(element_of(feature, georeference))
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"{path}: feature {position} is not an element of a map: {error!r}") from error
-    return tuple(elements)
-
-
-def format_timestamp(nanoseconds: int) -> str:
-    """Return ISO 8601 UTC with nine digits: ``format_timestamp(1)`` is ``1970-01-01T00:00:00.000000001Z``."""
-    seconds, rest = divmod(int(nanoseconds), 1_000_000_000)
-    return (EPOCH + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest:09d}Z"
-
-
-def parse_timestamp(text: str) -> int:
-    """Return the nanoseconds of a text that :func:`format_timestamp` made; raises ValueError for others."""
-    match = re.fullmatch(r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)\.(\d{9})Z", text)
-    if match is None:
-        raise ValueError(f"not a timestamp of the form 2024-01-31T12:00:00.123456789Z: {text!r}")
-    moment = datetime.strptime(match[1] + "+0000", "%Y-%m-%dT%H:%M:%S%z") - EPOCH
-    return (moment.days * 86_400 + moment.seconds) * 1_000_000_000 + int(match[2])
+def _reference_system(member: Any) -> str:
+    """Return the name of the reference system in the member ``crs``, which GDAL and QGIS write for all but WGS84."""
+    if member is None:
+        return "EPSG:4326"
+    properties = member.get("properties") if isinstance(member, dict) else None
+    return str(properties.get("name", "")) if isinstance(properties, dict) else ""
 
 
 def geometry_of(kind: ElementKind, points: Float, georeference: Georeference) -> tuple[dict[str, Any], bool]:
@@ -209,29 +183,6 @@ def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any
         if element.source_track_ids:
             properties["source_track_ids"] = [list(tracks) for tracks in element.source_track_ids]
     return {"type": "Feature", "geometry": geometry, "properties": properties}
-
-
-def element_of(feature: Mapping[str, Any], georeference: InvertibleGeoreference) -> MapElement:
-    """Return the element that :func:`feature_of` made a feature of; raises KeyError, TypeError or ValueError."""
-    properties, geometry = feature["properties"], feature["geometry"]
-    kind = ElementKind[properties["kind"].upper()]
-    expected = "Polygon" if kind.is_ring else "LineString"
-    if geometry["type"] != expected:
-        raise ValueError(f"a {kind.label} must be a {expected}, not a {geometry['type']}")
-    degrees = np.array(geometry["coordinates"][0] if kind.is_ring else geometry["coordinates"], dtype=np.float64)
-    deviation = properties.get("deviation_m")
-    return MapElement(
-        kind=kind,
-        points=georeference.from_wgs84(degrees),
-        confidence=float(properties["confidence"]),
-        observations=int(properties["observations"]),
-        first_seen=parse_timestamp(properties["first_seen"]),
-        last_seen=parse_timestamp(properties["last_seen"]),
-        track_ids=tuple(int(track) for track in properties["track_ids"]),
-        deviation=None if deviation is None else np.array(deviation, dtype=np.float64),
-        sources=tuple(map(str, properties.get("sources", ()))),
-        source_track_ids=tuple(tuple(map(int, tracks)) for tracks in properties.get("source_track_ids", ())),
-    )
 
 
 def _positions(feature: Mapping[str, Any]) -> Float:

@@ -15,12 +15,14 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
-import numpy as np
 import shapely
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
-from mapfusion.formats.geojson import elements_of, feature_of, origin_of
+from mapfusion.formats.features import Feature, map_of
+from mapfusion.formats.geojson import feature_of, origin_of
+from mapfusion.formats.reading_notes import ReadingNotes
+from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 TYPES = {
@@ -28,6 +30,7 @@ TYPES = {
     ElementKind.DIVIDER: "line_thin",
     ElementKind.BOUNDARY: "road_border",
 }
+KINDS = {name: kind.label for kind, name in TYPES.items()}
 PREFIX = "predmapnet:"
 
 
@@ -61,7 +64,9 @@ def write_lanelet(
 
 
 def read_lanelet(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
-    """Read a map that :func:`write_lanelet` wrote; see :func:`mapfusion.formats.geojson.read_geojson`.
+    """Read a map that :func:`write_lanelet` wrote, also after JOSM has edited it; what is deleted there stays so.
+
+    Arguments and result are those of :func:`mapfusion.formats.geojson.read_geojson`.
 
     Raises:
         ValueError: not a file of ours; says where it breaks.
@@ -69,22 +74,28 @@ def read_lanelet(path: Path, georeference: InvertibleGeoreference | None = None)
     """
     try:
         root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise ValueError(f"{path}: not XML: {error}") from error
     if root.tag != "osm":
         raise ValueError(f"{path}: not OSM XML: the root is <{root.tag}>")
+    notes = ReadingNotes()
+    nodes = {node.attrib.get("id"): node for node in root.iter("node")}
+    ways = [way for way in root.iter("way") if not _deleted(way)]
+    if len(ways) < len(root.findall("way")):
+        notes.add("ways that are marked as deleted are left out")
+    meta = root.find("meta")
     try:
-        positions = {
-            node.attrib["id"]: (float(node.attrib["lon"]), float(node.attrib["lat"])) for node in root.iter("node")
-        }
-        features = [_feature(way, positions) for way in root.iter("way")]
-        meta = root.find("meta")
-        origin = json.loads(meta.attrib["provenance"]) if meta is not None else {}
+        features = [_feature(way, nodes, place, notes) for place, way in enumerate(ways)]
+        origin = None if meta is None else json.loads(meta.attrib["provenance"])
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: not a map of ours: {error!r}") from error
-    table = np.array(list(positions.values())).reshape(-1, 2)
-    box = [*table.min(axis=0), *table.max(axis=0)] if len(table) else None
-    return GlobalMap(elements_of(features, georeference, box, path), origin)
+        raise ValueError(f"{path}: not a map of ours: {error}") from error
+    to_degrees = ToDegrees("EPSG:4326", str(path))
+    return map_of((Feature(feature, to_degrees) for feature in features), origin, path, georeference, notes)
+
+
+def _deleted(thing: ElementTree.Element) -> bool:
+    """Whether JOSM or a server has marked a node or way as deleted."""
+    return thing.attrib.get("action") == "delete" or thing.attrib.get("visible") == "false"
 
 
 def _nodes(element: MapElement, feature: Mapping[str, Any], first: int) -> Iterator[str]:
@@ -111,14 +122,33 @@ def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _feature(way: ElementTree.Element, positions: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    points = [positions[reference.attrib["ref"]] for reference in way.iter("nd")]
+def _feature(
+    way: ElementTree.Element, nodes: Mapping[str | None, ElementTree.Element], place: int, notes: ReadingNotes
+) -> dict[str, Any]:
+    """Return a way as a GeoJSON feature; raises ValueError for one whose nodes are missing or nowhere."""
+    name = f"way {way.attrib.get('id')}"
+    points = []
+    for reference in way.iter("nd"):
+        node = nodes.get(reference.attrib.get("ref"))
+        if node is None:
+            raise ValueError(f"{name} goes through the node {reference.attrib.get('ref')}, which is not in the file")
+        if _deleted(node):
+            notes.add("nodes that are marked as deleted are left out", place)
+            continue
+        try:
+            points.append((float(node.attrib["lon"]), float(node.attrib["lat"])))
+        except (KeyError, ValueError) as error:
+            raise ValueError(
+                f"node {node.attrib.get('id')} of {name} has no latitude and longitude; a map in local_x and local_y "
+                "alone cannot be read"
+            ) from error
     properties: dict[str, Any] = {}
     for tag in way.iter("tag"):
-        key, value = tag.attrib["k"], tag.attrib["v"]
+        key, value = tag.attrib.get("k", ""), tag.attrib.get("v", "")
+        if key == "type":
+            properties.setdefault("kind", KINDS.get(value, value))
         if key.startswith(PREFIX):
-            name = key.removeprefix(PREFIX)
-            properties[name] = value if name in ("kind", "first_seen", "last_seen") else json.loads(value)
+            properties[key.removeprefix(PREFIX)] = value
     ring = properties.get("kind") == ElementKind.PED_CROSSING.label
     geometry = {"type": "Polygon", "coordinates": [points]} if ring else {"type": "LineString", "coordinates": points}
     return {"geometry": geometry, "properties": properties}

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from mapfusion.arrays import Float
+from mapfusion.georeference import check_reach
 
 WGS84_SEMI_MAJOR_AXIS = 6_378_137.0
 WGS84_ECCENTRICITY_SQUARED = 6.69437999014e-3
@@ -51,12 +52,15 @@ class LocalPlane:
         return np.asarray(np.radians(np.array([parallel, meridian])))
 
     def to_wgs84(self, points: Float) -> Float:
-        """Map ``(n, 2)`` metres to ``(n, 2)`` longitude and latitude, degrees."""
+        """Map ``(n, 2)`` metres to ``(n, 2)`` longitude and latitude, degrees; ValueError far from the origin."""
+        check_reach(points, self.name)
         return np.asarray(points / self.scale + self.origin)
 
     def from_wgs84(self, points: Float) -> Float:
-        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres."""
-        return np.asarray((points - self.origin) * self.scale)
+        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres; ValueError far from the origin."""
+        metres = np.asarray((points - self.origin) * self.scale)
+        check_reach(metres, self.name)
+        return metres
 
 
 def common_plane(boxes: Float) -> LocalPlane:

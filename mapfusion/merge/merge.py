@@ -18,7 +18,7 @@ from scipy.special import expit
 from mapfusion.alignment import Alignment, Landmarks, align, landmarks
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.by_suffix import MapWriter, read_box, read_map
+from mapfusion.formats.by_suffix import MapWriter, check_frames, frame_of, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.geometry import simplified_rows
 from mapfusion.georeference import InvertibleGeoreference
@@ -28,7 +28,7 @@ from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, Looks
 from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.lines import fuse_lines
-from mapfusion.merge.report import MapStatus, MergeReport, short_names
+from mapfusion.merge.report import MapStatus, MergeReport, notes_of_copies, short_names
 from mapfusion.merge.rings import fuse_rings
 from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, cut_line, tiles_of
 
@@ -50,6 +50,9 @@ class _MapSummary:
     evidence: float
     digest: str
     observed: list[list[list[float]]] | None
+    notes: tuple[str, ...]
+    frame: str
+    origin: str
 
     @property
     def centre(self) -> Float:
@@ -181,6 +184,9 @@ class _Merge:
             first.setdefault(entry.digest, entry)
         self.entries = list(first.values())
         self.duplicates = tuple(sorted(entry.name for entry in entries if first[entry.digest] is not entry))
+        self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes)
+        self.notes += notes_of_copies((entry.name, entry.origin) for entry in self.entries)
+        check_frames((entry.name, entry.frame) for entry in entries)
         self.empty = sorted(set(names) - {entry.name for entry in entries})
         self.names = list(names)
         self.statuses: list[MapStatus] = [MapStatus(name, 0.0, 0.0, 0, "the map is empty") for name in self.empty]
@@ -210,7 +216,7 @@ class _Merge:
     def report(self) -> MergeReport:
         """Return the report, once all elements were taken."""
         statuses = tuple(sorted(self.statuses, key=lambda status: status.name))
-        return MergeReport(statuses, self.duplicates, self.counts, self.metres, self.tile_count)
+        return MergeReport(statuses, self.duplicates, self.counts, self.metres, self.tile_count, self.notes)
 
     def _counted(self, element: MapElement) -> MapElement:
         self.counts[element.kind.label] += 1
@@ -306,7 +312,11 @@ def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
     evidence = sum(element.length * element.observations for element in raw)
     low, high = points.min(axis=0), points.max(axis=0)
     observed = raw.provenance.get("observed")
-    return _MapSummary(name, place, low, high, round(evidence, 3), digest.hexdigest(), observed)
+    told = repr(sorted(raw.provenance.items()))
+    origin = hashlib.sha256(told.encode()).hexdigest() if "created" in raw.provenance else name
+    return _MapSummary(
+        name, place, low, high, round(evidence, 3), digest.hexdigest(), observed, raw.notes, frame_of(raw), origin
+    )
 
 
 def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list[int]]]:

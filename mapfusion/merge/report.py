@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,7 @@ class MergeReport:
         duplicates: names of maps that are the same as another, and were counted once.
         elements, metres: of the result, by label of the kind.
         tiles: how many were fused.
+        notes: of the reader: names of maps, and what was repaired, supplied or left out of each.
     """
 
     maps: tuple[MapStatus, ...]
@@ -44,18 +45,40 @@ class MergeReport:
     elements: dict[str, int]
     metres: dict[str, float]
     tiles: int
+    notes: tuple[tuple[str, str], ...] = ()
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
     """Return names of files: their stems, with as many folders before as it takes to tell them apart.
 
+    The same map in two formats is told apart by the endings.
+
     Raises:
         ValueError: the same file is given twice.
     """
-    for depth in range(1, max(len(path.parts) for path in paths) + 1 if paths else 1):
-        names = ["/".join((*path.parts[-depth:-1], path.stem)) for path in paths]
-        if len(set(names)) == len(names):
-            return names
+    deepest = max((len(path.parts) for path in paths), default=0)
+    names: list[str] = []
+    for with_ending in (False, True):
+        for depth in range(1, deepest + 1):
+            lasts = [path.name if with_ending else path.stem for path in paths]
+            names = ["/".join((*path.parts[-depth:-1], last)) for path, last in zip(paths, lasts, strict=True)]
+            if len(set(names)) == len(names):
+                return names
     if not paths:
         return []
     raise ValueError(f"a map is given twice: {', '.join(sorted({n for n in names if names.count(n) > 1}))}")
+
+
+def notes_of_copies(maps: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
+    """Return a note for each map that is an edited copy of another.
+
+    Args:
+        maps: names, and digests of what the maps say of their making, the moment included.
+    """
+    first: dict[str, str] = {}
+    notes = []
+    for name, origin in maps:
+        other = first.setdefault(origin, name)
+        if other != name:
+            notes.append((name, f"it is a copy of {other} that was edited; both count, as if two drives had seen it"))
+    return tuple(notes)

@@ -15,6 +15,7 @@ from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.georeference import Georeference
 from predmapnet.datasets.argoverse2_files import (
     ARGOVERSE2_CAMERAS,
+    IMAGE_ENDINGS,
     POSES,
     city,
     every_sweep,
@@ -29,11 +30,13 @@ from predmapnet.datasets.argoverse2_frames import (
     strided_over_time,
     sweeps_with_images,
 )
+from predmapnet.datasets.fields import check_principal_point, whole_field
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_argoverse2_sweep
+from predmapnet.datasets.log_checks import check_cameras, check_clock, check_drive
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
@@ -43,6 +46,10 @@ KEY_FRAME_STRIDE = 4
 """Every fourth lidar sweep of 10 Hz is a key frame (2.5 Hz), as in the official vector-map data sets."""
 GROUND_HEIGHT = -0.33
 """z of the road under the car in the ego frame, metres: its origin is the middle of the rear axle."""
+QUATERNION, TRANSLATION = ("qw", "qx", "qy", "qz"), ("tx_m", "ty_m", "tz_m")
+INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
+NAMED = 8
+"""Number of things that a message names."""
 OLD_TRAIN_LOGS = 700
 """Logs in the train folder of the whole data set."""
 
@@ -159,7 +166,7 @@ class Argoverse2Source:
         cameras = self._logs[log] / "sensors" / "cameras"
         if not cameras.is_dir():
             raise UserError(f"{self._logs[log]} has no images, but the official frames are those with all images.")
-        return [timed_files(cameras / name, ".jpg")[0] for name in ARGOVERSE2_CAMERAS]
+        return [timed_files(cameras / name, *IMAGE_ENDINGS)[0] for name in ARGOVERSE2_CAMERAS]
 
     def _info(self, log: str) -> SceneInfo:
         folder = self._logs[log]
@@ -224,10 +231,25 @@ class Argoverse2Scene:
         self.georeference = argoverse2_georeference(info.location)
         self.timestamps = timestamps
         self._folder = folder
-        self._poses = read_table(folder / POSES)
+        self._poses = read_table(folder / POSES, ("timestamp_ns", *QUATERNION, *TRANSLATION))
         self._pose_rows = {int(time): row for row, time in enumerate(self._poses["timestamp_ns"])}
         if len(self.timestamps) == 0:
             raise UserError(f"{folder} names no lidar sweep and no image that is a frame, so it has none.")
+        self._check_drive()
+
+    def _check_drive(self) -> None:
+        """Raise UserError for times of another unit, and for poses that no car has."""
+        path = self._folder / POSES
+        times = self._poses["timestamp_ns"]
+        if not np.issubdtype(times.dtype, np.integer):
+            raise UserError(f"{path}: the column timestamp_ns must hold integer nanoseconds, not {times.dtype}.")
+        order = np.argsort(times, kind="stable")
+        table = {name: values[order] for name, values in self._poses.items()}
+        quaternions = np.stack([table[name] for name in QUATERNION], axis=1).astype(np.float64)
+        positions = np.stack([table[name] for name in TRANSLATION[:2]], axis=1).astype(np.float64)
+        whole = np.isfinite(positions).all(axis=1) & (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < 1e-3)
+        check_clock(table["timestamp_ns"][whole], positions[whole], "nanoseconds", str(path))
+        check_drive(quaternions[whole], positions[whole], str(path))
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -241,11 +263,13 @@ class Argoverse2Scene:
                 f"{self._folder} has no calibration folder, so its cameras are unknown: it can serve ground truth, but "
                 "it cannot be mapped. Fetch the log's calibration/*.feather."
             )
-        intrinsics = rows_by_sensor(calibration / "intrinsics.feather")
-        mounting = rows_by_sensor(calibration / "egovehicle_SE3_sensor.feather")
+        intrinsics = rows_by_sensor(calibration / "intrinsics.feather", INTRINSICS)
+        mounting = rows_by_sensor(calibration / "egovehicle_SE3_sensor.feather", (*QUATERNION, *TRANSLATION))
         missing = [name for name in ARGOVERSE2_CAMERAS if name not in intrinsics or name not in mounting]
         if missing:
             raise UserError(f"{calibration} does not describe the cameras {', '.join(missing)}.")
+        stored = [[mounting[name][key] for key in QUATERNION] for name in ARGOVERSE2_CAMERAS]
+        check_cameras(stored, f"{calibration / 'egovehicle_SE3_sensor.feather'}")
         return tuple(_camera(name, intrinsics[name], mounting[name], calibration) for name in ARGOVERSE2_CAMERAS)
 
     @cached_property
@@ -257,7 +281,14 @@ class Argoverse2Scene:
                 f"{self._folder} has no images (looked for sensors/cameras/ring_*/<timestamp>.jpg): it can serve "
                 "ground truth, but it cannot be mapped. Fetch the log's camera images."
             )
-        return {name: timed_files(folder / name, ".jpg") for name in ARGOVERSE2_CAMERAS}
+        images = {name: timed_files(folder / name, *IMAGE_ENDINGS) for name in ARGOVERSE2_CAMERAS}
+        if not any(files for _, files in images.values()):
+            found = ", ".join(sorted(path.name for path in folder.iterdir())[:NAMED]) or "nothing"
+            raise UserError(
+                f"{folder} holds no image that can be used: looked for ring_*/<timestamp>.jpg (or .jpeg, .png) of "
+                f"{', '.join(ARGOVERSE2_CAMERAS)}; found {found}."
+            )
+        return images
 
     def frame(self, index: int) -> Frame:
         """Return frame ``index``: pose at exactly the sweep's time stamp, nearest image of each camera within 25 ms.
@@ -294,8 +325,8 @@ class Argoverse2Scene:
             raise UserError(f"{where}: there is no pose with the time stamp {timestamp} of the lidar sweep.")
         row = self._pose_rows[timestamp]
         return pose_matrix(
-            [self._poses[name][row] for name in ("qw", "qx", "qy", "qz")],
-            [self._poses[name][row] for name in ("tx_m", "ty_m", "tz_m")],
+            [self._poses[name][row] for name in QUATERNION],
+            [self._poses[name][row] for name in TRANSLATION],
             f"{where}, row {row}",
         )
 
@@ -337,16 +368,19 @@ def _nearest(times: Integer, files: Sequence[Path], timestamp: int) -> Path | No
 
 
 def _camera(name: str, intrinsics: dict[str, Any], mounting: dict[str, Any], folder: Path) -> Camera:
+    where = f"{folder / 'intrinsics.feather'}, {name}"
     matrix = np.eye(3)
-    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] = [intrinsics[key] for key in ("fx_px", "fy_px", "cx_px", "cy_px")]
+    matrix[[0, 1, 0, 1], [0, 1, 2, 2]] = [intrinsics[key] for key in INTRINSICS[:4]]
+    width, height = whole_field(intrinsics, "width_px", where), whole_field(intrinsics, "height_px", where)
+    check_principal_point(matrix, width, height, where)
     return Camera(
         name=name,
-        width=int(intrinsics["width_px"]),
-        height=int(intrinsics["height_px"]),
+        width=width,
+        height=height,
         intrinsics=matrix,
         camera_to_ego=pose_matrix(
-            [mounting[key] for key in ("qw", "qx", "qy", "qz")],
-            [mounting[key] for key in ("tx_m", "ty_m", "tz_m")],
+            [mounting[key] for key in QUATERNION],
+            [mounting[key] for key in TRANSLATION],
             f"{folder / 'egovehicle_SE3_sensor.feather'}, {name}",
         ),
         ground_height=GROUND_HEIGHT,

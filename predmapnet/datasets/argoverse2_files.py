@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 from numpy.typing import NDArray
-from pyarrow import ArrowInvalid, feather
+from pyarrow import ArrowInvalid, feather, types
 
 from mapfusion.arrays import Integer
+from predmapnet.datasets.large_tables import parse_json
 from predmapnet.datasets.splits import SPLITS
 from predmapnet.errors import UserError
 
@@ -27,6 +27,8 @@ ARGOVERSE2_CAMERAS = (
 )
 """The cameras in the order of the official vector-map data sets."""
 SWEEP_LIST = "lidar_timestamps_ns.json"
+IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
+_TIME_STAMP = re.compile(r"[0-9]{1,18}")
 
 
 def find_logs(root: Path) -> dict[str, Path]:
@@ -41,17 +43,26 @@ def every_sweep(folder: Path) -> Integer:
     """Time stamps of all lidar sweeps; without lidar files, of front images at the sweeps' rate."""
     sweeps, _ = timed_files(folder / "sensors" / "lidar", ".feather")
     if len(sweeps) == 0 and (folder / SWEEP_LIST).is_file():
-        sweeps = np.sort(np.array(_read_json(folder / SWEEP_LIST), dtype=np.int64))
+        sweeps = _sweep_list(folder / SWEEP_LIST)
     if len(sweeps):
         return sweeps
     # The front camera runs at twice the lidar's rate.
-    images, _ = timed_files(folder / "sensors" / "cameras" / ARGOVERSE2_CAMERAS[0], ".jpg")
+    images, _ = timed_files(folder / "sensors" / "cameras" / ARGOVERSE2_CAMERAS[0], *IMAGE_ENDINGS)
     return images[::2]
 
 
-def timed_files(folder: Path, suffix: str) -> tuple[Integer, list[Path]]:
+def _sweep_list(path: Path) -> Integer:
+    """Time stamps of the file that lists them, ascending. Raises UserError."""
+    times = parse_json(path.read_bytes(), path)
+    if not isinstance(times, list) or not all(type(time) is int and 0 <= time < 2**63 for time in times):
+        raise UserError(f"{path} must be a list of time stamps (integer nanoseconds), not {str(times)[:60]}.")
+    return np.array(sorted(set(times)), dtype=np.int64)
+
+
+def timed_files(folder: Path, *endings: str) -> tuple[Integer, list[Path]]:
     """Files named by their time stamps: ``(n,)`` ascending nanoseconds, and the files; empty without folder."""
-    files = sorted((int(path.stem), path) for path in folder.glob(f"*{suffix}") if path.stem.isdigit())
+    found = (path for path in folder.glob("*") if path.suffix.lower() in endings)
+    files = sorted((int(path.stem), path) for path in found if _TIME_STAMP.fullmatch(path.stem))
     return np.array([time for time, _ in files], dtype=np.int64), [path for _, path in files]
 
 
@@ -64,28 +75,37 @@ def city(folder: Path) -> str:
     return "unknown"
 
 
-def rows_by_sensor(path: Path) -> dict[str, dict[str, Any]]:
+def rows_by_sensor(path: Path, columns: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Read a calibration table: its rows by sensor. Raises UserError like :func:`read_table`."""
-    table = read_table(path)
+    table = read_table(path, columns, texts=("sensor_name",))
     return {
         str(name): {column: values[row] for column, values in table.items()}
         for row, name in enumerate(table["sensor_name"])
     }
 
 
-def read_table(path: Path) -> dict[str, NDArray[Any]]:
-    """Read a feather file: its columns by name. Raises UserError if it is missing or damaged."""
+def read_table(path: Path, columns: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
+    """Read a feather file: its columns by name.
+
+    Args:
+        path: the file.
+        columns: those that it must have, of numbers.
+        texts: those that it must have besides.
+
+    Raises:
+        UserError: the file is missing or damaged, lacks a column, or a column holds something else.
+    """
     try:
         table = feather.read_table(path)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist. The log is incomplete: fetch it again.") from None
     except (ArrowInvalid, OSError) as error:
         raise UserError(f"{path} is not a readable feather file ({error}). Fetch it again.") from None
-    return {name: table.column(name).to_numpy() for name in table.column_names}
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return orjson.loads(path.read_bytes())
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{path} is not valid JSON ({error}). Fetch it again.") from None
+    missing = [name for name in (*columns, *texts) if name not in table.column_names]
+    if missing:
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(table.column_names)}.")
+    for name in columns:
+        kind = table.schema.field(name).type
+        if not (types.is_integer(kind) or types.is_floating(kind)):
+            raise UserError(f"{path}: the column {name} must hold numbers, not {kind}.")
+    return {name: table.column(name).to_numpy() for name in (*columns, *texts)}

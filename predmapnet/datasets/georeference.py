@@ -10,6 +10,9 @@ import numpy as np
 from pyproj import CRS, Transformer
 
 from mapfusion.arrays import Float
+from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.georeference import check_reach
+from predmapnet.errors import UserError
 
 NUSCENES_ORIGINS = {
     "boston-seaport": (42.336849169438615, -71.05785369873047),
@@ -49,6 +52,7 @@ class SphereGeoreference:
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres (x east, y north) to ``(n, 2)`` longitude and latitude, degrees."""
+        check_reach(points, self.name)
         latitude = np.radians(self.latitude)
         bearing = np.arctan2(points[:, 0], points[:, 1])
         angle = np.hypot(points[:, 0], points[:, 1]) / self.radius
@@ -81,9 +85,55 @@ class UtmGeoreference:
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, city frame, to ``(n, 2)`` longitude and latitude, degrees."""
+        check_reach(points, self.name)
         east, north = self._utm.transform(self.longitude, self.latitude)
         longitude, latitude = self._utm.transform(points[:, 0] + east, points[:, 1] + north, direction="INVERSE")
         return np.stack([longitude, latitude], axis=1)
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """A frame whose place on Earth is not known: its maps lie about longitude 0 and latitude 0, where no road is.
+
+    Attributes:
+        frame: name of the frame; maps of one frame may be merged.
+        east, north: metres that are taken off first, of frames whose coordinates are large (UTM, for example).
+    """
+
+    frame: str
+    east: float = 0.0
+    north: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name for metadata."""
+        shifted = f", {self.east:.0f} m east and {self.north:.0f} m north taken off" if self.east or self.north else ""
+        return f"local frame of {self.frame}, whose place on Earth is not known{shifted}"
+
+    def to_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` metres to ``(n, 2)`` longitude and latitude, degrees."""
+        return LocalPlane(0.0, 0.0, self.name).to_wgs84(points - [self.east, self.north])
+
+
+LOCAL_GRID = 100_000.0
+"""Spacing of the origins of local frames, metres, so that logs of one place get the same one."""
+
+
+def local_frame(name: str, position: Float) -> LocalFrame:
+    """Return a local frame for poses around ``position``, ``(2,)``, metres."""
+    east, north = (np.round(position / LOCAL_GRID) * LOCAL_GRID).tolist()
+    return LocalFrame(name, east, north)
+
+
+def given_origin(text: str) -> LocalPlane:
+    """Return the frame whose origin a user gives as ``latitude,longitude``, x east and y north. Raises UserError."""
+    try:
+        latitude, longitude = (float(number) for number in text.split(","))
+    except ValueError as error:
+        raise UserError(f"--origin {text}: latitude,longitude in degrees are expected, as in 49.01,8.41") from error
+    if not (abs(latitude) < 85 and abs(longitude) <= 180):
+        raise UserError(f"--origin {text} does not lie on Earth; latitude comes first")
+    return LocalPlane(longitude, latitude, "given origin")
 
 
 def nuscenes_georeference(location: str) -> SphereGeoreference | None:

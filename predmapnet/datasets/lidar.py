@@ -36,8 +36,6 @@ def read_nuscenes_sweep(path: Path, lidar_to_ego: Float) -> Float:
 
 def read_argoverse2_sweep(path: Path) -> Float:
     """Read a lidar ``.feather`` file: ``(n, 3) float64``, metres, ego frame. Raises UserError if it is no sweep."""
-    table = read_table(path)
-    missing = {"x", "y", "z"} - table.keys()
-    if missing:
-        raise UserError(f"{path} is not a lidar sweep: it has no column {', '.join(sorted(missing))}.")
-    return np.stack([table[axis].astype(np.float64) for axis in ("x", "y", "z")], axis=1)
+    axes = ("x", "y", "z")
+    table = read_table(path, axes)
+    return np.stack([table[axis].astype(np.float64) for axis in axes], axis=1)

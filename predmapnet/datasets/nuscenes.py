@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,16 @@ from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from mapfusion.georeference import Georeference
+from predmapnet.datasets.fields import check_principal_point, numbers_field, text_field, whole_field
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
 from predmapnet.datasets.ground_truth.whole_map import truth_map
+from predmapnet.datasets.large_tables import Record
 from predmapnet.datasets.lidar import read_nuscenes_sweep
-from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Record, Tables
+from predmapnet.datasets.log_checks import check_cameras, check_clock, check_drive, usable_poses
+from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Tables, choose_version, expansion_path
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
@@ -32,37 +35,6 @@ NEW_SPLIT = {"train": "nuscenes_new_train", "val": "nuscenes_new_val"}
 DEMO_MARKER = "demo_world.json"
 """A data set with this file in its root was rendered by the demo world."""
 LEFT_OUT = "left out of the published training sets"
-
-
-def find_versions(root: Path) -> tuple[str, ...]:
-    """Return the names of the ``v1.0-*`` table folders below ``root``, sorted."""
-    return tuple(sorted(path.parent.name for path in root.glob("v1.0-*/scene.json")))
-
-
-def choose_version(root: Path, version: str | None) -> str:
-    """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
-
-    Raises:
-        UserError: nothing there, not what was asked for, or several without a clear first choice.
-    """
-    if not root.is_dir():
-        raise UserError(f"The nuScenes folder {root} does not exist.")
-    versions = find_versions(root)
-    if not versions:
-        raise UserError(
-            f"{root} holds no nuScenes tables: looked for folders v1.0-*/ with scene.json in them. "
-            "The data root is the folder that contains v1.0-trainval (or v1.0-mini), samples and maps."
-        )
-    if version is not None:
-        if version not in versions:
-            raise UserError(f"{root} holds no nuScenes version '{version}'; found: {', '.join(versions)}.")
-        return version
-    if "v1.0-trainval" in versions:
-        return "v1.0-trainval"
-    others = [name for name in versions if name != "v1.0-mini"] or ["v1.0-mini"]
-    if len(others) > 1:
-        raise UserError(f"{root} holds several nuScenes versions ({', '.join(versions)}): say which one to open.")
-    return others[0]
 
 
 class NuScenesSource:
@@ -126,15 +98,15 @@ class NuScenesSource:
         return infos if split is None else tuple(info for info in infos if info.split == split)
 
     def _info(self, name: str) -> SceneInfo:
-        record = self.tables.scenes[name]
-        log = self.tables.logs.get(record["log_token"])
+        record, where = self.tables.scenes[name], str(self.tables.path("scene"))
+        log = self.tables.logs.get(text_field(record, "log_token", where))
         if log is None:
             raise UserError(f"{self.tables.folder}: scene {name} names a log that log.json does not hold.")
         return SceneInfo(
             name=name,
             split=self._split_of.get(name, "test"),
-            frames=int(record["nbr_samples"]),
-            location=str(log["location"]),
+            frames=whole_field(record, "nbr_samples", where),
+            location=text_field(log, "location", str(self.tables.path("log"))),
             description=LEFT_OUT if name in split_names("nuscenes_skipped") else str(record.get("description", "")),
         )
 
@@ -147,16 +119,17 @@ class NuScenesSource:
                 f"{self.tables.folder} holds no scene '{scene}' among its {len(self.tables.scenes)} scenes.{hint}"
             )
         info = self._info(scene)
-        return NuScenesScene(self.root, self.tables, info, self._ground_truth(info.location), self._georeference(info))
+        truth = partial(self._ground_truth, info.location)
+        return NuScenesScene(self.root, self.tables, info, truth, self._georeference(info))
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to, by sample token; unknown tokens are absent."""
-        names = {record["token"]: name for name, record in self.tables.scenes.items()}
+        names = {record.get("token"): name for name, record in self.tables.scenes.items()}
         samples = ((token, self.tables.samples.get(token)) for token in tokens)
         return {
             token: names[sample["scene_token"]]
             for token, sample in samples
-            if sample is not None and sample["scene_token"] in names
+            if sample is not None and sample.get("scene_token") in names
         }
 
     def _georeference(self, info: SceneInfo) -> Georeference | None:
@@ -168,7 +141,7 @@ class NuScenesSource:
 
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
         if location not in self._maps:
-            path = self.root / "maps" / "expansion" / f"{location}.json"
+            path = expansion_path(self.root, location)
             self._maps[location] = NuScenesGroundTruth(path, self.keep_corners) if path.is_file() else None
         return self._maps[location]
 
@@ -190,7 +163,6 @@ class NuScenesScene:
         info: the scene's line in the listing.
         rig: cameras of the first frame, in the order of the official vector-map data sets.
         georeference: of the scene's map; None for a map that nuScenes does not know.
-        ground_truth: the map expansion of the scene's location, or None.
     """
 
     def __init__(
@@ -198,7 +170,7 @@ class NuScenesScene:
         root: Path,
         tables: Tables,
         info: SceneInfo,
-        ground_truth: NuScenesGroundTruth | None,
+        ground_truth: Callable[[], NuScenesGroundTruth | None],
         georeference: Georeference | None,
     ) -> None:
         """Read the scene's records.
@@ -207,41 +179,56 @@ class NuScenesScene:
             root: folder with ``samples``.
             tables: of the version.
             info: the scene's line in the listing.
-            ground_truth: its map, if there is one.
+            ground_truth: reads its map, if there is one; called when it is needed.
             georeference: of the global frame, if it is known.
         """
         self.info = info
-        self.ground_truth = ground_truth
+        self._read_ground_truth = ground_truth
         self.georeference = georeference
         self._root = root
         self._tables = tables
         self._sensor_poses: dict[str, Float] = {}
         self._frames = self._read_frames()
         self._cameras = self._read_cameras()
+        self._check()
         self.rig: Rig = self.frame(0).rig
 
     def __len__(self) -> int:
         return len(self._frames)
 
+    @cached_property
+    def ground_truth(self) -> NuScenesGroundTruth | None:
+        """The map expansion of the scene's location, or None. Raises UserError for one that cannot be used."""
+        return self._read_ground_truth()
+
     def _read_frames(self) -> list[_KeyFrame]:
-        samples = []
-        token = self._tables.scenes[self.info.name]["first_sample_token"]
+        samples: list[Record] = []
+        scene = self._tables.scenes[self.info.name]
+        token = text_field(scene, "first_sample_token", str(self._tables.path("scene")))
+        table = str(self._tables.path("sample"))
         while token:
             if token not in self._tables.samples:
                 raise UserError(f"{self._tables.path('sample')}: sample {token} of {self.info.name} is missing.")
             samples.append(self._tables.samples[token])
-            token = samples[-1]["next"]
+            # Some writers of this schema end a scene with null instead of an empty text.
+            ended = samples[-1].get("next", "") is None and token == scene.get("last_sample_token")
+            token = "" if ended else text_field(samples[-1], "next", table)
             if len(samples) > len(self._tables.samples):
                 raise UserError(f"{self._tables.path('sample')}: the samples of {self.info.name} run in a circle.")
         if not samples:
             raise UserError(f"{self._tables.folder}: {self.info.name} holds no frame.")
         sensors = self._tables.sample_data(sample["token"] for sample in samples)
-        pose_tokens = {token: data[LIDAR]["ego_pose_token"] for token, data in sensors.items() if LIDAR in data}
+        table_of_data = str(self._tables.path("sample_data"))
+        pose_tokens = {
+            token: text_field(data[LIDAR], "ego_pose_token", table_of_data)
+            for token, data in sensors.items()
+            if LIDAR in data
+        }
         poses = self._tables.ego_poses(pose_tokens.values())
         return [
             _KeyFrame(
                 token=sample["token"],
-                timestamp=int(sample["timestamp"]) * 1000,
+                timestamp=whole_field(sample, "timestamp", table) * 1000,
                 ego_pose=poses.get(pose_tokens.get(sample["token"], "")),
                 sensors=sensors[sample["token"]],
             )
@@ -250,11 +237,33 @@ class NuScenesScene:
 
     def _read_cameras(self) -> dict[str, Record]:
         """First record of each camera, in rig order: stands in for the calibration where a frame lacks an image."""
-        return {
+        cameras = {
             channel: next(frame.sensors[channel] for frame in self._frames if channel in frame.sensors)
             for channel in NUSCENES_CAMERAS
             if any(channel in frame.sensors for frame in self._frames)
         }
+        if not cameras:
+            found = sorted({channel for frame in self._frames for channel in frame.sensors})
+            raise UserError(
+                f"{self._tables.path('sensor')}: {self.info.name} has no camera of the names that nuScenes gives "
+                f"({', '.join(NUSCENES_CAMERAS)}); its sensors are {', '.join(found) or 'none'}."
+            )
+        return cameras
+
+    def _check(self) -> None:
+        """Raise UserError for times that do not go on or are of another unit, and for cameras and poses of no car."""
+        name, path = self.info.name, self._tables.path
+        stored = [self._calibration(record).get("rotation") for record in self._cameras.values()]
+        check_cameras(stored, f"{path('calibrated_sensor')}, {name}")
+        times = np.array([frame.timestamp // 1000 for frame in self._frames], dtype=np.int64)
+        late = np.flatnonzero(np.diff(times) <= 0)
+        if len(late):
+            frame = int(late[0]) + 1
+            raise UserError(f"{path('sample')}, {name}: the time of frame {frame} is not after that of the one before.")
+        poses = [frame.ego_pose or {} for frame in self._frames]
+        rows, quaternions, positions = usable_poses([(pose.get("rotation"), pose.get("translation")) for pose in poses])
+        check_clock(times[rows], positions, "microseconds", f"{path('sample')}, {name}")
+        check_drive(quaternions, positions, f"{path('ego_pose')}, {name}")
 
     def _where(self, index: int, table: str) -> str:
         return f"{self.info.name}, frame {index}, {self._tables.folder / table}.json"
@@ -271,7 +280,7 @@ class NuScenesScene:
         return ego_to_global, self._sensor_to_ego(frame.sensors[LIDAR], self._where(index, "calibrated_sensor"))
 
     def _calibration(self, record: Record) -> Record:
-        return self._tables.calibrations[record["calibrated_sensor_token"]]
+        return self._tables.calibrations[str(record["calibrated_sensor_token"])]
 
     def _sensor_to_ego(self, record: Record, where: str) -> Float:
         """Return the pose of a sensor on the car; the same few are asked for in every frame."""
@@ -307,8 +316,9 @@ class NuScenesScene:
         instant = self.instant(index)
         ego_to_shifted = inverse_pose(instant.ego_to_global) @ self._poses(index)[0]
         frame = self._frames[index]
+        table = str(self._tables.path("sample_data"))
         images = {
-            channel: self._root / frame.sensors[channel]["filename"]
+            channel: self._root / text_field(frame.sensors[channel], "filename", table)
             for channel in NUSCENES_CAMERAS
             if channel in frame.sensors
         }
@@ -323,18 +333,20 @@ class NuScenesScene:
                 for channel, first in self._cameras.items()
             ),
             images={channel: path for channel, path in images.items() if path.is_file()},
+            missing={channel: path for channel, path in images.items() if not path.is_file()},
         )
 
     def _camera(self, channel: str, record: Record, ego_to_shifted: Float, index: int) -> Camera:
         calibration = self._calibration(record)
         where = f"{self._where(index, 'calibrated_sensor')}, {channel}"
-        intrinsics = np.array(calibration["camera_intrinsic"], dtype=np.float64)
-        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all():
-            raise UserError(f"{where}: camera_intrinsic must be 3 x 3 numbers but is {intrinsics.tolist()}.")
+        table = str(self._tables.path("sample_data"))
+        intrinsics = numbers_field(calibration, "camera_intrinsic", (3, 3), where)
+        width, height = whole_field(record, "width", table), whole_field(record, "height", table)
+        check_principal_point(intrinsics, width, height, where)
         return Camera(
             name=channel,
-            width=int(record["width"]),
-            height=int(record["height"]),
+            width=width,
+            height=height,
             intrinsics=intrinsics,
             camera_to_ego=ego_to_shifted @ self._sensor_to_ego(record, where),
         )
@@ -346,7 +358,8 @@ class NuScenesScene:
 
     def lidar_path(self, index: int) -> Path | None:
         """Return the lidar file of frame ``index``, or None if it is not there."""
-        path = self._root / self._frames[index].sensors[LIDAR]["filename"]
+        record, table = self._frames[index].sensors[LIDAR], str(self._tables.path("sample_data"))
+        path = self._root / text_field(record, "filename", table)
         return path if path.is_file() else None
 
     def lidar(self, index: int) -> Float | None:
@@ -379,4 +392,7 @@ class NuScenesScene:
 
 
 def _pose(record: Record, where: str) -> Float:
+    for name in ("rotation", "translation"):
+        if record.get(name) is None:
+            raise UserError(f"{where}, record {record.get('token')}: the field '{name}' is missing.")
     return pose_matrix(record["rotation"], record["translation"], where)

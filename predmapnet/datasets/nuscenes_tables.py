@@ -1,32 +1,76 @@
 """Tables of a nuScenes data set, read only as far as mapping needs them.
 
-``sample_data.json`` and ``ego_pose.json`` of v1.0-trainval hold 2.6 million records each, of which mapping wants
-the key frames of one scene at a time. They are searched as bytes, and only the records asked for are parsed.
+``sample_data.json`` and ``ego_pose.json`` of v1.0-trainval hold 2.6 million records each, of which mapping wants the
+key frames of the cameras and the lidar. The tables are parsed in pieces, and only those are kept.
 """
 
 from __future__ import annotations
 
-import mmap
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import orjson
-
+from predmapnet.datasets.fields import text_field
+from predmapnet.datasets.large_tables import Mark, Record, parse_json, select_records
 from predmapnet.errors import UserError
+from predmapnet.files import file_name
 
-Record = dict[str, Any]
 LIDAR = "LIDAR_TOP"
 NUSCENES_CAMERAS = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT")
 """The cameras in the order of the official vector-map data sets."""
 
-_KEY_FRAME = (b'"is_key_frame": true', b'"is_key_frame":true')
-_SAMPLE_TOKEN = re.compile(rb'"sample_token"\s*:\s*"([^"]*)"')
+_KEY_FRAME = re.compile(rb'"is_key_frame"\s*:\s*(true|false)')
 _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]*)"')
+
+
+def find_versions(root: Path) -> tuple[str, ...]:
+    """Return the names of the ``v1.0-*`` table folders below ``root``, sorted."""
+    return tuple(sorted(path.parent.name for path in root.glob("v1.0-*/scene.json")))
+
+
+def choose_version(root: Path, version: str | None) -> str:
+    """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
+
+    Raises:
+        UserError: nothing there, not what was asked for, or several without a clear first choice.
+    """
+    if not root.is_dir():
+        raise UserError(f"The nuScenes folder {root} does not exist.")
+    versions = find_versions(root)
+    if not versions:
+        raise UserError(
+            f"{root} holds no nuScenes tables: looked for folders v1.0-*/ with scene.json in them. "
+            "The data root is the folder that contains v1.0-trainval (or v1.0-mini), samples and maps."
+        )
+    if version is not None:
+        if version not in versions:
+            raise UserError(f"{root} holds no nuScenes version '{version}'; found: {', '.join(versions)}.")
+        return version
+    if "v1.0-trainval" in versions:
+        return "v1.0-trainval"
+    others = [name for name in versions if name != "v1.0-mini"] or ["v1.0-mini"]
+    if len(others) > 1:
+        raise UserError(f"{root} holds several nuScenes versions ({', '.join(versions)}): say which one to open.")
+    return others[0]
+
+
+def expansion_path(root: Path, location: str) -> Path:
+    """Return where the map expansion of a location lies; the name comes from a table and must not lead elsewhere."""
+    return root / "maps" / "expansion" / f"{file_name(location)}.json"
+
+
+class SensorData(NamedTuple):
+    """Key-frame record of ``sample_data.json``; None where a field is missing, so that its reader can say so."""
+
+    token: Any
+    ego_pose_token: Any
+    calibrated_sensor_token: Any
+    filename: Any
+    width: Any
+    height: Any
 
 
 @dataclass(frozen=True)
@@ -40,12 +84,9 @@ class Tables:
     folder: Path
 
     def read(self, table: str) -> list[Record]:
-        """Parse a whole table. Raises UserError if it is missing or not JSON."""
+        """Parse a whole table. Raises UserError if it is missing or not a table."""
         path = self.path(table)
-        try:
-            records = orjson.loads(path.read_bytes())
-        except orjson.JSONDecodeError as error:
-            raise UserError(f"{path} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
+        records = parse_json(path.read_bytes(), path)
         if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
             raise UserError(f"{path} is not a nuScenes table: it must be a list of records.")
         return records
@@ -59,118 +100,96 @@ class Tables:
 
     @cached_property
     def scenes(self) -> dict[str, Record]:
-        """Scene records by name, in file order."""
-        return {_field(record, "name", "scene"): record for record in self.read("scene")}
+        """Scene records by name, in file order; a name that comes again is told apart by a number."""
+        path = self.path("scene")
+        scenes: dict[str, Record] = {}
+        for record in self.read("scene"):
+            name = unique = text_field(record, "name", str(path))
+            number = 1
+            while unique in scenes:
+                number += 1
+                unique = f"{name} ({number})"
+            scenes[unique] = record
+        return scenes
 
     @cached_property
     def logs(self) -> dict[str, Record]:
         """Log records by token."""
-        return _by_token(self.read("log"), "log")
+        return self._by_token("log")
 
     @cached_property
     def samples(self) -> dict[str, Record]:
         """Sample (key frame) records by token."""
-        return _by_token(self.read("sample"), "sample")
+        return self._by_token("sample")
 
     @cached_property
     def calibrations(self) -> dict[str, Record]:
         """Calibrated sensors by token, each with its ``channel``."""
-        channels = {token: record["channel"] for token, record in _by_token(self.read("sensor"), "sensor").items()}
-        records = _by_token(self.read("calibrated_sensor"), "calibrated_sensor")
+        sensors, where = self._by_token("sensor"), str(self.path("sensor"))
+        channels = {token: text_field(record, "channel", where) for token, record in sensors.items()}
+        where = str(self.path("calibrated_sensor"))
         return {
-            token: {**record, "channel": channels.get(record["sensor_token"], "")} for token, record in records.items()
+            token: {**record, "channel": channels.get(text_field(record, "sensor_token", where), "")}
+            for token, record in self._by_token("calibrated_sensor").items()
         }
 
+    def _by_token(self, table: str) -> dict[str, Record]:
+        where = str(self.path(table))
+        return {text_field(record, "token", where): record for record in self.read(table)}
+
     @cached_property
-    def _key_frame_spans(self) -> dict[bytes, list[tuple[int, int]]]:
-        """Byte ranges of each sample's key-frame records in ``sample_data.json``, radars left out."""
-        spans: dict[bytes, list[tuple[int, int]]] = {}
-        with _mapped(self.path("sample_data")) as data:
-            for start, end in _records_with(data, _KEY_FRAME):
-                record = data[start:end]
-                token = _SAMPLE_TOKEN.search(record)
-                if token is not None and b"RADAR" not in record:
-                    spans.setdefault(token.group(1), []).append((start, end))
-        return spans
+    def _key_frames(self) -> dict[str, dict[str, SensorData]]:
+        """Key-frame records of the lidar and of all cameras, by sample token and channel."""
+        path = self.path("sample_data")
+        calibrations = self.calibrations
+        channels = {
+            token: calibration["channel"]
+            for token, calibration in calibrations.items()
+            if "RADAR" not in calibration["channel"]
+        }
+        result: dict[str, dict[str, SensorData]] = {}
+
+        def keep(record: Record) -> None:
+            flag = record.get("is_key_frame")
+            if not isinstance(flag, int) or flag not in (0, 1):  # true and false are integers, too
+                raise UserError(
+                    f"{path}, record {record.get('token')}: the field 'is_key_frame' must be true or false, not {flag}."
+                )
+            if not flag:
+                return
+            calibration = text_field(record, "calibrated_sensor_token", str(path))
+            if calibration not in calibrations:
+                raise UserError(f"{path}: record {record.get('token')} names a calibrated sensor that does not exist.")
+            if calibration in channels:
+                sample = text_field(record, "sample_token", str(path))
+                data = SensorData(*map(record.get, SensorData._fields))
+                result.setdefault(sample, {})[channels[calibration]] = data
+
+        select_records(path, keep, Mark(_KEY_FRAME, {b"true"}.__contains__))
+        return result
 
     def sample_data(self, sample_tokens: Iterable[str]) -> dict[str, dict[str, Record]]:
         """Return the key-frame ``sample_data`` records of some samples, by sample token and channel."""
-        path = self.path("sample_data")
-        result: dict[str, dict[str, Record]] = {}
-        with _mapped(path) as data:
-            for token in sample_tokens:
-                spans = self._key_frame_spans.get(token.encode(), [])
-                records = [_parse(data[start:end], path) for start, end in spans]
-                result[token] = {self._channel(record, path): record for record in records}
-        return result
-
-    def _channel(self, record: Record, path: Path) -> str:
-        calibration = self.calibrations.get(record.get("calibrated_sensor_token", ""))
-        if calibration is None:
-            raise UserError(f"{path}: record {record.get('token')} names a calibrated sensor that does not exist.")
-        return str(calibration["channel"])
+        return {
+            token: {channel: data._asdict() for channel, data in self._key_frames.get(token, {}).items()}
+            for token in sample_tokens
+        }
 
     @cached_property
-    def _pose_offsets(self) -> dict[bytes, int]:
-        """Byte offsets of the records of the lidar's key frames in ``ego_pose.json``."""
-        with _mapped(self.path("sample_data")) as data:
-            wanted = {
-                match.group(1)
-                for spans in self._key_frame_spans.values()
-                for start, end in spans
-                if (match := re.search(rb'"ego_pose_token"\s*:\s*"([^"]*)"', data[start:end])) is not None
-            }
-        with _mapped(self.path("ego_pose")) as data:
-            return {match.group(1): match.start() for match in _TOKEN.finditer(data) if match.group(1) in wanted}
+    def _lidar_poses(self) -> dict[str, Record]:
+        """Records of ``ego_pose.json`` at the lidar's key frames, by token."""
+        lidars = (sensors[LIDAR].ego_pose_token for sensors in self._key_frames.values() if LIDAR in sensors)
+        wanted = {token for token in lidars if isinstance(token, str)}
+        path = self.path("ego_pose")
+
+        def keep(record: Record) -> Record | None:
+            token = record.get("token")
+            return record if isinstance(token, str) and token in wanted else None
+
+        encoded = {token.encode() for token in wanted}
+        records = select_records(path, keep, Mark(_TOKEN, encoded.__contains__))
+        return {record["token"]: record for record in records}
 
     def ego_poses(self, tokens: Iterable[str]) -> dict[str, Record]:
-        """Return ``ego_pose`` records by token; tokens that the table lacks are absent."""
-        path = self.path("ego_pose")
-        result: dict[str, Record] = {}
-        with _mapped(path) as data:
-            for token in tokens:
-                offset = self._pose_offsets.get(token.encode())
-                if offset is not None:
-                    result[token] = _parse(data[data.rfind(b"{", 0, offset) : data.find(b"}", offset) + 1], path)
-        return result
-
-
-def _field(record: Mapping[str, Any], name: str, table: str) -> Any:
-    if name not in record:
-        raise UserError(f"A record of {table}.json has no field '{name}': {dict(record)}.")
-    return record[name]
-
-
-def _by_token(records: list[Record], table: str) -> dict[str, Record]:
-    return {_field(record, "token", table): record for record in records}
-
-
-def _parse(text: bytes, path: Path) -> Record:
-    try:
-        # The tables of other tools may hold NaN, which is not JSON; null lets the pose check name the frame.
-        record: Record = orjson.loads(re.sub(rb"\b(?:NaN|-?Infinity)\b", b"null", text))
-    except orjson.JSONDecodeError as error:
-        excerpt = text[:120].decode(errors="replace")
-        raise UserError(f"{path} holds a record that is not valid JSON ({error}): {excerpt}") from None
-    return record
-
-
-def _records_with(data: mmap.mmap, needles: tuple[bytes, ...]) -> Iterator[tuple[int, int]]:
-    """Yield the byte range of every flat record that contains one of the needles, in file order for each needle."""
-    for needle in needles:
-        position = data.find(needle)
-        while position >= 0:
-            end = data.find(b"}", position) + 1
-            if end == 0:
-                return
-            yield data.rfind(b"{", 0, position), end
-            position = data.find(needle, end)
-
-
-@contextmanager
-def _mapped(path: Path) -> Iterator[mmap.mmap]:
-    """Map a file into memory for reading."""
-    if path.stat().st_size == 0:
-        raise UserError(f"{path} is empty. The file is damaged: fetch it again.")
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        yield data
+        """Return ``ego_pose`` records of the lidar's key frames by token; tokens that the table lacks are absent."""
+        return {token: self._lidar_poses[token] for token in tokens if token in self._lidar_poses}

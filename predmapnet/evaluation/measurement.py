@@ -6,21 +6,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mapfusion.elements import GlobalMap
+from mapfusion.arrays import Integer
+from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.errors import UserError
+from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
 from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
 from predmapnet.evaluation.consistency_ap import Flags, consistency_flags, matched_tracks, with_formed_tracks
 from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.evaluation.frechet_ap import FRECHET_THRESHOLDS, frechet_flags
 from predmapnet.evaluation.global_map import GlobalMapQuality, global_map_quality, pool, seen_area
+from predmapnet.evaluation.global_map_ap import global_map_matches
 from predmapnet.evaluation.identity import IdentityCounts, count_identities, pool_identities
-from predmapnet.evaluation.precision_recall import AveragePrecision
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate_matches
 from predmapnet.evaluation.raster_ap import (
     RasterAveragePrecision,
     RasterMatches,
     raster_from_matches,
     raster_matches,
 )
+from predmapnet.evaluation.stability import Stability, scene_instances, stability
+from predmapnet.evaluation.stability_matching import SceneInstances
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.evaluation.tracks import truth_track_ids
 
 
@@ -32,19 +39,27 @@ class SceneMeasurement:
         frames: the frames that were measured, in order.
         thresholds: chamfer thresholds, metres.
         chamfer: per frame true-positive flags.
+        frechet: the same by the order-aware distance.
+        ahead, rear: per frame the matches of each half of the region.
         raster: per frame matches by overlap.
         tracked, tracked_unanchored: per frame flags of C-mAP with the ids that the predictions carry, and the same
             without asking for consistency.
         formed_frames, formed: frames with ids formed from the predictions, and their flags.
         identity: id switches and track lengths.
         forecast: errors of the forecasts.
-        global_map: None where there is no global map or no true one.
+        protocol, instances: of the stability.
+        global_map, global_matches: None where there is no global map or no true one.
         mapping_seconds: wall time of mapping; None where results were read.
+        absent_frames: frames that the results lack, measured as empty ones.
+        weights_sha256: of the weights that made the maps; None where unknown.
     """
 
     frames: tuple[EvaluationFrame, ...]
     thresholds: tuple[float, ...]
     chamfer: list[Flags]
+    frechet: list[Flags]
+    ahead: list[Matches]
+    rear: list[Matches]
     raster: list[tuple[RasterMatches, ...]]
     tracked: list[Flags]
     tracked_unanchored: list[Flags]
@@ -52,8 +67,13 @@ class SceneMeasurement:
     formed: list[Flags]
     identity: IdentityCounts
     forecast: ForecastErrors
+    protocol: Protocol
+    instances: SceneInstances
     global_map: GlobalMapQuality | None
+    global_matches: Matches | None
     mapping_seconds: float | None = None
+    absent_frames: int = 0
+    weights_sha256: str | None = None
 
 
 @dataclass(frozen=True)
@@ -63,19 +83,49 @@ class Measurement:
     scenes: tuple[str, ...]
     frames: tuple[EvaluationFrame, ...]
     chamfer: AveragePrecision
+    frechet: AveragePrecision
+    ahead: AveragePrecision
+    rear: AveragePrecision
     raster: RasterAveragePrecision
     consistency: AveragePrecision
     consistency_unanchored: AveragePrecision
     formed_consistency: AveragePrecision
     identity: IdentityCounts
     forecast: ForecastErrors
+    stability: Stability
     global_map: GlobalMapQuality | None
+    global_map_ap: AveragePrecision | None
     frames_per_second: float | None
+    absent_frames: int
+    weights_sha256: str | None
 
     @property
     def has_tracks(self) -> bool:
         """Whether any prediction carries a track id."""
         return any((frame.predicted.track_ids >= 0).any() for frame in self.frames)
+
+    @property
+    def roi(self) -> RegionOfInterest:
+        """The region in which everything was measured."""
+        return self.frames[0].predicted.roi
+
+    def missing(self) -> list[str]:
+        """Return what the figures lack, as sentences for the reader."""
+        found = []
+        if self.absent_frames:
+            found.append(f"{self.absent_frames} of {len(self.frames)} frames are not in the results and count as empty")
+        absent = [kind.kind.label for kind in self.chamfer.kinds if not kind.truths]
+        if absent:
+            found.append(
+                f"no ground truth of {', '.join(absent)}: counts as 0 in every mean over the kinds but raster's"
+            )
+        if not self.has_tracks:
+            found.append("no track ids: consistency AP is of ids formed afterwards, and there is no map of the drive")
+        elif self.global_map is None:
+            found.append("no map of the drive for some scenes: they have no tracked element or no true map")
+        if not len(self.forecast.errors[0]):
+            found.append("no forecasts")
+        return found
 
     def figures(self) -> dict[str, Any]:
         """Nested figures as written to JSON: ``chamfer_ap.mAP``, ``global_map.f1@1.0`` and so on.
@@ -94,10 +144,15 @@ class Measurement:
             "frames": len(self.frames),
             "frames_per_second": self.frames_per_second,
             "chamfer_ap": self.chamfer.figures(),
+            "ahead_ap": self.ahead.figures(),
+            "rear_ap": self.rear.figures(),
+            "frechet_ap": self.frechet.figures(),
             "consistency_ap": consistency,
             "consistency_ap_formed_ids": formed,
             "raster_ap": self.raster.figures(),
+            "stability": self.stability.figures(),
             "global_map": None if self.global_map is None else self.global_map.figures(),
+            "global_map_ap": None if self.global_map_ap is None else self.global_map_ap.figures(),
             "forecast": self.forecast.figures(),
             "tracks": self.identity.figures(),
         }
@@ -108,6 +163,7 @@ def measure_scene(
     global_map: GlobalMap | None = None,
     truth_map: GlobalMap | None = None,
     mapping_seconds: float | None = None,
+    protocol: Protocol = Protocol.ANCHORED,
 ) -> SceneMeasurement:
     """Measure one scene.
 
@@ -115,6 +171,7 @@ def measure_scene(
         frames: all frames of the scene in order.
         global_map, truth_map: maps of the whole drive in the same global frame, if both exist.
         mapping_seconds: wall time that mapping took, carried along.
+        protocol: of the stability.
 
     Raises:
         UserError: the scene has no frame.
@@ -126,14 +183,18 @@ def measure_scene(
     truth_ids = truth_track_ids(frames)
     matched = matched_tracks(frames, truth_ids, thresholds)
     formed_frames = with_formed_tracks(frames)
-    quality = None
+    quality = global_matches = None
     if global_map is not None and truth_map is not None:
         seen = seen_area([frame.predicted.ego_to_global for frame in frames], roi)
         quality = global_map_quality(global_map, truth_map, seen)
+        global_matches = global_map_matches(global_map, truth_map, seen, thresholds)
     return SceneMeasurement(
         frames=tuple(frames),
         thresholds=thresholds,
         chamfer=[frame_flags(frame, thresholds) for frame in frames],
+        frechet=[frechet_flags(frame) for frame in frames],
+        ahead=[half_matches(frame, Half.AHEAD, thresholds) for frame in frames],
+        rear=[half_matches(frame, Half.REAR, thresholds) for frame in frames],
         raster=[raster_matches(frame) for frame in frames],
         tracked=consistency_flags(frames, matched),
         tracked_unanchored=consistency_flags(frames, matched, anchored=False),
@@ -141,7 +202,10 @@ def measure_scene(
         formed=consistency_flags(formed_frames, matched_tracks(formed_frames, truth_ids, thresholds)),
         identity=count_identities(frames, truth_ids, [found[:, -1] for found in matched]),
         forecast=forecast_errors(frames),
+        protocol=protocol,
+        instances=scene_instances(frames, _element_ids(frames, truth_ids), protocol),
         global_map=quality,
+        global_matches=global_matches,
         mapping_seconds=mapping_seconds,
     )
 
@@ -150,20 +214,26 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
     """Pool scenes; their order breaks ties of scores.
 
     Raises:
-        UserError: there is no scene, or the scenes were mapped with different regions of interest.
+        UserError: there is no scene, or the scenes were mapped with different regions of interest or weights.
     """
     if not scenes:
         raise UserError("There is no scene to measure.")
     if len({scene.thresholds for scene in scenes}) > 1:
         raise UserError("The scenes have regions of interest of different sizes; measure them apart.")
+    if len({scene.weights_sha256 for scene in scenes}) > 1:
+        raise UserError("The scenes were mapped with different weights; measure each method apart.")
     thresholds = scenes[0].thresholds
     frames = [frame for scene in scenes for frame in scene.frames]
     maps = [scene.global_map for scene in scenes if scene.global_map is not None]
+    matches = [scene.global_matches for scene in scenes if scene.global_matches is not None]
     seconds = [scene.mapping_seconds for scene in scenes if scene.mapping_seconds is not None]
     return Measurement(
         scenes=tuple(scene.frames[0].scene for scene in scenes),
         frames=tuple(frames),
         chamfer=chamfer_from_flags(frames, _flat([scene.chamfer for scene in scenes]), thresholds),
+        frechet=chamfer_from_flags(frames, _flat([scene.frechet for scene in scenes]), FRECHET_THRESHOLDS),
+        ahead=accumulate_matches([match for scene in scenes for match in scene.ahead], thresholds),
+        rear=accumulate_matches([match for scene in scenes for match in scene.rear], thresholds),
         raster=raster_from_matches([match for scene in scenes for match in scene.raster]),
         consistency=chamfer_from_flags(frames, _flat([scene.tracked for scene in scenes]), thresholds),
         consistency_unanchored=chamfer_from_flags(
@@ -176,10 +246,20 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
         ),
         identity=pool_identities([scene.identity for scene in scenes]),
         forecast=pool_forecasts([scene.forecast for scene in scenes]),
+        stability=stability([(scene.frames, scene.instances) for scene in scenes], scenes[0].protocol),
         global_map=pool(maps) if len(maps) == len(scenes) else None,
+        global_map_ap=accumulate_matches(matches, thresholds) if len(matches) == len(scenes) else None,
         frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
+        absent_frames=sum(scene.absent_frames for scene in scenes),
+        weights_sha256=scenes[0].weights_sha256,
     )
 
 
 def _flat(flags: Sequence[list[Flags]]) -> list[Flags]:
     return [entry for scene in flags for entry in scene]
+
+
+def _element_ids(frames: Sequence[EvaluationFrame], track_ids: Sequence[Integer]) -> list[Integer]:
+    """Return which elements of the source's map the truths are; their track ids where the source cannot tell."""
+    known = all((frame.truth.element_ids >= 0).all() for frame in frames)
+    return [frame.truth.element_ids for frame in frames] if known else list(track_ids)

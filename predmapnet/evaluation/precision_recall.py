@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind
 
 _EPSILON = float(np.finfo(np.float32).eps)
@@ -81,6 +81,35 @@ class AveragePrecision:
             entry |= {"truths": result.truths, "predictions": result.predictions}
             figures[result.kind.label] = entry
         return figures
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Matched predictions of one frame or one map.
+
+    Attributes:
+        kinds: ``(n,)`` of the predictions.
+        scores: ``(n,)``.
+        flags: ``(n, thresholds) int8``: 1 true positive, 0 false positive.
+        truths: ``(3,)`` number of true elements per kind.
+    """
+
+    kinds: Integer
+    scores: Float
+    flags: NDArray[np.int8]
+    truths: Integer
+
+
+def accumulate_matches(matches: Sequence[Matches], thresholds: Sequence[float]) -> AveragePrecision:
+    """Collect the matches of all frames or maps into average precisions; their order decides equal scores."""
+    truths = np.sum([np.zeros(len(ElementKind), dtype=np.int64), *(part.truths for part in matches)], axis=0)
+    return accumulate(
+        [part.kinds for part in matches],
+        [part.scores for part in matches],
+        [part.flags for part in matches],
+        truths.tolist(),
+        thresholds,
+    )
 
 
 def precision_recall(

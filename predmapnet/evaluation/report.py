@@ -15,6 +15,7 @@ from mapfusion.elements import ElementKind
 from predmapnet.evaluation.measurement import Measurement
 from predmapnet.evaluation.precision_recall import KindResult
 from predmapnet.evaluation.report_drawings import COLOURS, draw_bars, draw_curves, draw_frame
+from predmapnet.evaluation.scene_figures import SCENE_FIGURES
 from predmapnet.files import write_file
 
 WORST_FRAMES = 8
@@ -27,7 +28,7 @@ h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
 td:first-child, th:first-child { text-align: left; } th { border-bottom: 1px solid #9aa5b1; font-weight: 600; }
 figure { display: inline-block; margin: .5rem 1rem .5rem 0; } figcaption { font-size: .85rem; color: #52606d; }
-.note { color: #52606d; } svg { background: #fff; }
+.wide { overflow-x: auto; font-size: .85rem; } .note { color: #52606d; } svg { background: #fff; }
 """
 
 
@@ -47,13 +48,21 @@ def write_figures(path: Path, figures: Mapping[str, Any], context: Mapping[str, 
         temporary.write_bytes(orjson.dumps(content, option=orjson.OPT_INDENT_2) + b"\n")
 
 
-def write_report(path: Path, measurement: Measurement, context: Mapping[str, Any]) -> None:
-    """Write the HTML report: table, precision-recall curves, AP per threshold, worst frames beside the truth.
+def write_report(
+    path: Path,
+    measurement: Measurement,
+    context: Mapping[str, Any],
+    per_scene: Mapping[str, Mapping[str, float | int | None]],
+    origin: Mapping[str, str],
+) -> None:
+    """Write the HTML report: tables, precision-recall curves, AP per threshold, worst frames beside the truth.
 
     Args:
         path: the file; its folder exists.
         measurement: over all scenes.
-        context: ``dataset``, ``split``, ``synthetic``.
+        context: ``dataset``, ``split``, ``synthetic``, ``warnings``.
+        per_scene: see :func:`predmapnet.evaluation.scene_figures.scene_figures`.
+        origin: how the figures were made, by name: date, weights, command.
 
     Raises:
         UserError: the file cannot be written.
@@ -64,9 +73,13 @@ def write_report(path: Path, measurement: Measurement, context: Mapping[str, Any
     parts = [
         f"<h1>PredMapNet on {escape(what)}</h1>",
         f'<p class="note">{counts}, predmapnet {predmapnet.__version__}.{synthetic}</p>',
+        *(f'<p class="note">{escape(name)}: <code>{escape(text)}</code></p>' for name, text in origin.items()),
+        *(f"<p>Note: {escape(text)}.</p>" for text in (*context["warnings"], *measurement.missing())),
         _legend(),
         "<h2>Figures</h2>",
         _figures_table(measurement.figures()),
+        "<h2>Scenes, the worst first</h2>",
+        _scenes_table(per_scene),
         "<h2>Precision over recall, chamfer AP</h2>",
         *(_figure(draw_curves(kind.curves), _curve_caption(kind)) for kind in measurement.chamfer.kinds),
         "<h2>AP per threshold</h2>",
@@ -151,14 +164,35 @@ def _figures_table(figures: Mapping[str, Any]) -> str:
     return "".join(rows) + "</table>"
 
 
+def _scenes_table(per_scene: Mapping[str, Mapping[str, float | int | None]]) -> str:
+    """One row per scene; kinds that a scene does not hold are left out of its means."""
+    headings = "".join(f"<th>{text}</th>" for text in ("scene", "frames", *SCENE_FIGURES.values()))
+
+    def worth(name: str) -> float:
+        value = per_scene[name]["chamfer_mAP"]
+        return 2.0 if value is None else value
+
+    rows = [
+        f"<tr><td>{escape(name)}</td><td>{per_scene[name]['frames']}</td>"
+        f"{_cells([per_scene[name][key] for key in SCENE_FIGURES])}</tr>"
+        for name in sorted(per_scene, key=worth)
+    ]
+    return f'<div class="wide"><table><tr>{headings}</tr>{"".join(rows)}</table></div>'
+
+
 _ROWS = (
     ("chamfer AP", "chamfer_ap", "mAP", "AP"),
+    ("chamfer AP ahead of the car", "ahead_ap", "mAP", "AP"),
+    ("chamfer AP behind the car", "rear_ap", "mAP", "AP"),
+    ("order-aware AP (Frechet)", "frechet_ap", "mAP", "AP"),
     ("rasterisation AP", "raster_ap", "mAP", "AP"),
     ("consistency AP", "consistency_ap", "mAP", "AP"),
+    ("stability mAS", "stability", "mAS", "stability"),
     ("map precision at 1.0 m", "global_map", "precision@1.0", "precision@1.0"),
     ("map recall at 1.0 m", "global_map", "recall@1.0", "recall@1.0"),
     ("map F1 at 1.0 m", "global_map", "f1@1.0", "f1@1.0"),
     ("map element AP", "global_map", "element_mAP", "element_AP"),
+    ("global AP (GlobalMapNet)", "global_map_ap", "mAP", "AP"),
     ("lateral error, median (m)", "global_map", "lateral_median_m", "lateral_median_m"),
     ("lateral error, 95 % (m)", "global_map", "lateral_p95_m", "lateral_p95_m"),
     ("predicted per true element", "global_map", "fragmentation", "fragmentation"),

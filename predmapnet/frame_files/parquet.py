@@ -148,7 +148,13 @@ def read_frames(path: Path, scene: str | None = None) -> StoredFrames:
     """
     table = _open_table(path, filters=None if scene is None else [("scene", "=", scene)])
     frames = tuple(_frame_of(path, row) for row in table.to_pylist())
-    return StoredFrames(frames, json.loads((table.schema.metadata or {}).get(_PROVENANCE_KEY, b"{}")))
+    try:
+        provenance = json.loads((table.schema.metadata or {}).get(_PROVENANCE_KEY, b"{}"))
+    except ValueError:
+        provenance = None
+    if not isinstance(provenance, dict):
+        raise UserError(f"{path}: its provenance is not a JSON object; write the file again with --save-frames.")
+    return StoredFrames(frames, provenance)
 
 
 def refuse_pickle(path: Path) -> None:
@@ -190,11 +196,14 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
 
 def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:
     where = f"{path}, scene {row['scene']}, frame {row['index']}"
-    pose = np.array(row["ego_to_global"], dtype=np.float64)
-    if pose.shape != (16,):
-        raise UserError(f"{where}: the pose has {pose.size} numbers instead of 16.")
     forecasts, visible = row["forecasts"], row.get("visible")
+    absent = [name for name, value in row.items() if value is None and name not in ("token", "forecasts", "visible")]
+    if absent:
+        raise UserError(f"{where}: {', '.join(absent)} is null.")
     try:
+        pose = np.array(row["ego_to_global"], dtype=np.float64)
+        if pose.shape != (16,):
+            raise ValueError(f"the pose has {pose.size} numbers instead of 16")
         frame_map = FrameMap(
             timestamp=row["timestamp"],
             ego_to_global=pose.reshape(4, 4),
@@ -206,9 +215,9 @@ def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:
             forecasts=None if forecasts is None else tuple(_points(line) for line in forecasts),
             visible=None if visible is None else tuple(_points(line) for line in visible),
         )
-    except ValueError as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{where}: {error}.") from error
-    return StoredFrame(row["scene"], row["index"], row["token"], frame_map)
+    return StoredFrame(row["scene"], row["index"], row["token"] or "", frame_map)
 
 
 def _points(numbers: list[float]) -> Float:

@@ -16,17 +16,18 @@ with ``visible``, a list of rings, which are lists of points like vectors; a rin
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Float, Integer
-from mapfusion.elements import FrameMap, RegionOfInterest
+from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
+from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
 from predmapnet.frame_files.parquet import refuse_pickle
 from predmapnet.scenes import Instant
@@ -97,16 +98,34 @@ def read_submission(path: Path) -> dict[str, SubmittedFrame]:
     return submitted_frames(path, results)
 
 
-def submitted_frames(path: Path, results: Any) -> dict[str, SubmittedFrame]:
-    """Check and convert what :func:`load_results` returned; arguments, result and errors of :func:`read_submission`."""
-    frames: dict[str, SubmittedFrame] = {}
+def submitted_frames(
+    path: Path, results: Any, notes: list[str] | None = None, metres: bool = True
+) -> dict[str, SubmittedFrame]:
+    """Check and convert what :func:`load_results` returned, the frames of whatever detector.
+
+    Elements of classes that a map does not have (centerlines, for example) are left out.
+
+    Args:
+        path: of the file, for messages.
+        results: in one of the layouts above.
+        notes: receives what was left out.
+        metres: refuse points that all lie between 0 and 1.
+
+    Returns, raises: as :func:`read_submission`.
+    """
+    entries: dict[str, Any] = {}
     for name, entry in _entries(path, results):
-        if name in frames:
+        if name in entries:
             raise UserError(f"{path} holds the frame {name} twice.")
-        frames[name] = _frame_of(f"{path}, frame {name}", entry)
+        entries[name] = entry
+    left_out: Counter[str] = Counter()
+    frames = {name: _frame_of(f"{path}, frame {name}", entry, left_out) for name, entry in entries.items()}
     if not frames:
         raise UserError(f"{path} holds no frame.")
-    _check_metres(path, frames)
+    if metres:
+        _check_metres(path, frames)
+    if notes is not None:
+        notes.extend(f"{count} elements of the class {name} are left out" for name, count in sorted(left_out.items()))
     return frames
 
 
@@ -116,15 +135,25 @@ def load_results(path: Path) -> Any:
         raise UserError(f"There is no file {path}.")
     refuse_pickle(path)
     data = path.read_bytes()
-    try:
-        content = orjson.loads(data)
-    except orjson.JSONDecodeError:
-        try:
-            # Python's own writer puts NaN into files; it is read, so that the element that holds it can be named.
-            content = json.loads(data)
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path} is not valid JSON: {error}.") from error
-    return content.get("results") if isinstance(content, dict) else content
+    # Python's own writer puts NaN into files; it is read, so that the element that holds it can be named.
+    content = parse_json(data, path)
+    results = content.get("results") if isinstance(content, dict) else content
+    if isinstance(results, dict) and data.count(b'"vectors"') > len(results):
+        _refuse_repeated_names(data, path)
+    return results
+
+
+def _refuse_repeated_names(data: bytes, path: Path) -> None:
+    """Raise UserError for a JSON object that holds a name twice; readers take the last one and say nothing."""
+
+    def checked(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = Counter(name for name, _ in pairs)
+        repeated = [name for name, count in names.items() if count > 1]
+        if repeated:
+            raise UserError(f"{path} holds the frame (or key) {repeated[0]} twice.")
+        return dict(pairs)
+
+    json.loads(data.decode("utf-8-sig", errors="replace"), object_pairs_hook=checked)
 
 
 def is_maptr(results: Any) -> bool:
@@ -138,20 +167,25 @@ def _entries(path: Path, results: Any) -> Iterator[tuple[str, Any]]:
         yield from results.items()
     elif isinstance(results, list):
         for number, entry in enumerate(results):
+            if isinstance(entry, dict) and "sample_token" in entry:
+                yield str(entry["sample_token"]), entry
+                continue
             if not isinstance(entry, dict) or "scene_name" not in entry or "local_idx" not in entry:
-                raise UserError(f"{path}, entry {number}: a list of frames needs scene_name and local_idx in each.")
+                raise UserError(
+                    f"{path}, entry {number}: a list of frames needs sample_token, or scene_name and local_idx."
+                )
             yield position_name(entry["scene_name"], entry["local_idx"]), entry
     else:
         raise UserError(f"{path} is no submission: it has no object 'results' with one entry per frame token.")
 
 
-def _frame_of(where: str, entry: Any) -> SubmittedFrame:
+def _frame_of(where: str, entry: Any, left_out: Counter[str]) -> SubmittedFrame:
     if not isinstance(entry, dict):
         raise UserError(f"{where}: an object with vectors, scores and labels is expected, not {str(entry)[:40]}.")
     missing = [key for key in ("vectors", "scores", "labels") if key not in entry]
     if missing:
         raise UserError(f"{where}: {' and '.join(missing)} missing.")
-    kinds = _numbers(f"{where}, labels", entry["labels"], np.int64)
+    kinds = _kinds(where, entry["labels"])
     scores = _numbers(f"{where}, scores", entry["scores"], np.float64)
     ids = entry.get("global_ids")
     track_ids = np.full(len(kinds), -1) if ids is None else _numbers(f"{where}, global_ids", ids, np.int64)
@@ -165,7 +199,29 @@ def _frame_of(where: str, entry: Any) -> SubmittedFrame:
     if rings is not None and not isinstance(rings, list):
         raise UserError(f"{where}: visible must be a list of rings.")
     visible = None if rings is None else tuple(_polyline(f"{where}, visible ring {i}", r) for i, r in enumerate(rings))
-    return SubmittedFrame(kinds, scores, track_ids, polylines, visible)
+    kept = [row for row, kind in enumerate(kinds) if isinstance(kind, ElementKind)]
+    left_out.update(str(kind) for kind in kinds if not isinstance(kind, ElementKind))
+    return SubmittedFrame(
+        np.array([kinds[row] for row in kept], dtype=np.int64),
+        scores[kept],
+        track_ids[kept],
+        tuple(polylines[row] for row in kept),
+        visible,
+    )
+
+
+def _kinds(where: str, labels: Any) -> list[ElementKind | str]:
+    """Return the kinds of labels, numbers or names; those that a map does not have as texts."""
+    if not isinstance(labels, list):
+        raise UserError(f"{where}: labels must be a list, not {str(labels)[:40]}.")
+    kinds: list[ElementKind | str] = []
+    for label in labels:
+        if isinstance(label, str) and not label.strip().lstrip("-").isdigit():
+            kinds.append(ElementKind.__members__.get(label.strip().upper(), label.strip()[:40]))
+            continue
+        (number,) = _numbers(f"{where}, labels", [label], np.int64).tolist()
+        kinds.append(ElementKind(number) if number in list(ElementKind) else f"number {number}")
+    return kinds
 
 
 def _numbers(where: str, values: Any, kind: type[np.generic]) -> NDArray[Any]:
@@ -194,4 +250,7 @@ def _polyline(where: str, vector: Any) -> Float:
 def _check_metres(path: Path, frames: Mapping[str, SubmittedFrame]) -> None:
     lines = [line for frame in frames.values() for line in frame.polylines]
     if len(lines) >= _ENOUGH_TO_JUDGE and all(((line >= 0.0) & (line <= 1.0)).all() for line in lines):
-        raise UserError(f"{path}: all points lie between 0 and 1, so they are normalised; metres are expected.")
+        raise UserError(
+            f"{path}: all points lie between 0 and 1, so they are normalised; metres are expected. "
+            "integrate reads them with --normalised, as shares of the sides of the region (--roi)."
+        )

@@ -8,20 +8,20 @@ import numpy as np
 import rerun as rr
 
 from mapfusion.elements import ElementKind, GlobalMap
-from mapfusion.formats.geojson import read_geojson
+from mapfusion.formats.by_suffix import read_map
 from predmapnet.errors import UserError
 from predmapnet.recording.blueprint import WORLD_COORDINATES, map_blueprint
 from predmapnet.recording.palette import KIND_COLOURS
 
 
 def log_map_file(recording: rr.RecordingStream, path: Path) -> None:
-    """Draw a map that ``predmapnet infer`` wrote, in metres east and north of its middle.
+    """Draw a map of any format that ``predmapnet infer`` writes, in metres east and north of its middle.
 
     Raises:
         UserError: the file cannot be read, is no map of ours, or holds no elements.
     """
     try:
-        global_map = read_geojson(path)
+        global_map = read_map(path)
     except (OSError, ValueError) as error:
         raise UserError(f"cannot show {path}: {error}") from error
     if len(global_map) == 0:
@@ -50,7 +50,7 @@ def _summary(path: Path, global_map: GlobalMap) -> str:
         f"- {kind.label}: {len(global_map.of_kind(kind))} elements, {global_map.length(kind):.0f} m"
         for kind in ElementKind
     )
-    note = global_map.provenance.get("note", "")
+    note = "\n\n".join([str(global_map.provenance.get("note", "")), *global_map.notes])
     return (
         f"# {path.name}\n\n{note}\n\n{rows}\n\nMetres, north is up: blue crossings, orange dividers, green boundaries."
     )

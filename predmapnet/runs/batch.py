@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 import predmapnet
+from mapfusion.formats.local_plane import LocalPlane
 from predmapnet.errors import UserError
-from predmapnet.files import check_output, write_file
+from predmapnet.files import check_output, file_name, write_file
 from predmapnet.machine import NetworkOptions, begin_worker, stop_workers
 from predmapnet.runs.outputs import Outputs
 
@@ -44,6 +45,7 @@ class BatchSettings:
         allow_missing_cameras: go on where a camera has no image.
         recordings, frames: whether these files are written, too.
         threads: CPU threads of each process.
+        origin: of the logs' frame, if the user says it.
     """
 
     dataset: str
@@ -53,13 +55,15 @@ class BatchSettings:
     recordings: bool = False
     frames: bool = False
     threads: int = 1
+    origin: LocalPlane | None = None
 
     def outputs(self, scene: str, folder: Path) -> Outputs:
         """Name the files of one scene."""
+        name = file_name(scene)
         return Outputs(
-            map=folder / f"{scene}.geojson",
-            recording=folder / f"{scene}.rrd" if self.recordings else None,
-            frames=folder / f"{scene}.parquet" if self.frames else None,
+            map=folder / f"{name}.geojson",
+            recording=folder / f"{name}.rrd" if self.recordings else None,
+            frames=folder / f"{name}.parquet" if self.frames else None,
         )
 
 
@@ -143,13 +147,14 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
         settings.allow_missing_cameras,
         settings.network.precision,
         settings.network.compiled,
+        None if settings.origin is None else [settings.origin.longitude, settings.origin.latitude],
     ]
     return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 
 
 def summary_path(folder: Path, scene: str) -> Path:
     """Return the file whose presence marks a scene as done."""
-    return folder / f"{scene}.summary.json"
+    return folder / f"{file_name(scene)}.summary.json"
 
 
 def finished_before(scene: str, folder: Path, settings: BatchSettings, fingerprint: str) -> Outcome | None:
@@ -157,8 +162,11 @@ def finished_before(scene: str, folder: Path, settings: BatchSettings, fingerpri
     path = summary_path(folder, scene)
     if not path.is_file() or not all(file.is_file() for file in settings.outputs(scene, folder).paths):
         return None
-    summary = orjson.loads(path.read_bytes())
-    if summary.get("settings") != fingerprint:
+    try:
+        summary = orjson.loads(path.read_bytes())
+    except orjson.JSONDecodeError:
+        return None
+    if not isinstance(summary, dict) or summary.get("settings") != fingerprint:
         return None
     return Outcome(scene, "done before", summary["report"]["seconds"], summary["report"])
 
@@ -264,6 +272,6 @@ def _worker_pipeline(settings: BatchSettings) -> MappingPipeline:
         from predmapnet.runs.infer import MappingPipeline
 
         _pipeline = MappingPipeline.open(
-            settings.dataset, settings.data_root, settings.network, settings.allow_missing_cameras
+            settings.dataset, settings.data_root, settings.network, settings.allow_missing_cameras, settings.origin
         )
     return _pipeline

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,8 @@ from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
+from predmapnet.evaluation.recognition import check_region, frames_look_like, region_of
+from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.frame_files.parquet import read_frames, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
 from predmapnet.machine import NetworkOptions, begin_worker, stop_workers
@@ -40,7 +42,8 @@ class EvaluationSettings:
         split_scheme, official_frames: see :func:`predmapnet.sources.open_source`.
         results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
         network: of scenes that are mapped.
-        roi: region of a submission, which does not state it.
+        roi: region of a submission, which does not state it; see :func:`submitted_region`.
+        protocol: of the stability.
         threads: CPU threads of each process.
         cache: folder that keeps the ground truth; None computes it anew.
     """
@@ -52,6 +55,7 @@ class EvaluationSettings:
     results: Path | None = None
     network: NetworkOptions = field(default_factory=NetworkOptions)
     roi: RegionOfInterest = field(default_factory=RegionOfInterest)
+    protocol: Protocol = Protocol.ANCHORED
     threads: int = 1
     cache: Path | None = None
 
@@ -84,6 +88,19 @@ def scenes_to_measure(settings: EvaluationSettings, source: SceneSource, split: 
             f"{settings.results} lacks {len(missing)} of {len(wanted)} scenes of the split {split}: {named}"
         )
     return wanted
+
+
+def submitted_region(results: Path, stated: RegionOfInterest | None) -> RegionOfInterest:
+    """Recognise the region of a submission, or check the one that the user states.
+
+    Raises:
+        UserError: the submission is broken, mixes regions or has other axes, or contradicts what was stated.
+    """
+    polylines = [line for frame in _submission(results).values() for line in frame.polylines if np.isfinite(line).all()]
+    if stated is None:
+        return region_of(results, polylines)
+    check_region(results, polylines, stated)
+    return stated
 
 
 def measure_scenes(
@@ -126,13 +143,24 @@ def _measure(
 
         run = map_scene(scene, _mapper(settings))
         frames = _with_truth(scene, run.frame_maps, settings.cache)
-        return measure_scene(frames, run.global_map, scene.truth_map(), run.seconds)
+        measured = measure_scene(frames, run.global_map, scene.truth_map(), run.seconds, settings.protocol)
+        return replace(measured, weights_sha256=_mapper(settings).weights_sha256)
     if submitted is not None:
-        frame_maps = _submitted_maps(submitted, settings.roi, scene)
+        found = _Found(_submitted_maps(submitted, settings.roi, scene), len(scene) - len(submitted), None)
     else:
-        frame_maps = _stored_maps(settings.results, scene)
-    frames = _with_truth(scene, frame_maps, settings.cache)
-    return measure_scene(frames, _integrated(name, frame_maps), scene.truth_map())
+        found = _stored_maps(settings.results, scene, _source(settings).name)
+    frames = _with_truth(scene, found.maps, settings.cache)
+    measured = measure_scene(frames, _integrated(name, found.maps), scene.truth_map(), protocol=settings.protocol)
+    return replace(measured, absent_frames=found.absent, weights_sha256=found.weights_sha256)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Predictions for each frame of a scene, how many frames had none, and the weights that made them, if known."""
+
+    maps: list[FrameMap]
+    absent: int
+    weights_sha256: str | None
 
 
 @lru_cache(maxsize=1)
@@ -191,6 +219,8 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
         unknown = [name for name in submission if name not in scenes]
         if not scenes or (unknown and every_frame):
             example = f", {unknown[0]} for one" if unknown else ""
+            looks = frames_look_like(unknown)
+            example += f"; by their names they are {looks}" if looks else ""
             hint = " Does it need --official-frames?" if source.name == "argoverse2" else ""
             raise UserError(
                 f"{results}: {len(unknown)} of {len(submission)} frames are not in {source.name} in {source.root}"
@@ -211,17 +241,25 @@ def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -
     return maps
 
 
-def _stored_maps(results: Path, scene: Scene) -> list[FrameMap]:
+def _stored_maps(results: Path, scene: Scene, dataset: str) -> _Found:
     """Return the stored predictions for each frame of a scene; a frame that the file lacks has none."""
     name = scene.info.name
     path = results / f"{name}.parquet" if results.is_dir() else results
-    stored = {frame.index: frame.frame_map for frame in read_frames(path, name).frames}
+    content = read_frames(path, name)
+    stored = {frame.index: frame.frame_map for frame in content.frames}
     if not stored:
         raise UserError(f"{path} holds no frame of {name}.")
     if max(stored) >= len(scene) or min(stored) < 0:
         raise UserError(f"{path} holds frame {max(stored)} of {name}, which has {len(scene)} frames in the data set.")
-    roi = next(iter(stored.values())).roi
-    return [_at(path, name, index, scene.instant(index), stored.get(index), roi) for index in range(len(scene))]
+    made_of = content.provenance.get("dataset", dataset)
+    if made_of != dataset:
+        raise UserError(f"{path} was made of {made_of}, not of {dataset}; name that data set with --dataset.")
+    regions = {frame_map.roi for frame_map in stored.values()}
+    if len(regions) > 1:
+        raise UserError(f"{path} mixes frames of {len(regions)} regions of interest; measure them apart.")
+    roi = regions.pop()
+    maps = [_at(path, name, index, scene.instant(index), stored.get(index), roi) for index in range(len(scene))]
+    return _Found(maps, len(scene) - len(stored), content.provenance.get("weights_sha256"))
 
 
 def _at(
@@ -249,6 +287,10 @@ def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
 def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap], cache: Path | None) -> list[EvaluationFrame]:
     truths = scene.truths(frame_maps[0].roi, cache) if frame_maps else []
     if truths is None:
-        raise UserError(f"{scene.info.name} has no ground truth, so nothing can be measured against it.")
+        raise UserError(
+            f"{scene.info.name} has no ground truth, so nothing can be measured against it; it is looked for in "
+            f"maps/expansion/{scene.info.location}.json of a nuScenes data set (the map expansion, unpacked there), "
+            "and in map/log_map_archive_*.json of an Argoverse 2 log."
+        )
     pairs = zip(frame_maps, truths, strict=True)
     return [EvaluationFrame(scene.info.name, index, found, truth) for index, (found, truth) in enumerate(pairs)]

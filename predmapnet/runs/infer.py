@@ -15,10 +15,13 @@ import torch
 
 import predmapnet
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
-from mapfusion.formats.by_suffix import write_map
+from mapfusion.formats.by_suffix import LOCAL_FRAME, write_map
+from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.georeference import Georeference
 from mapfusion.ground import observed_rings
+from predmapnet.datasets.georeference import LocalFrame, local_frame
 from predmapnet.demo_world.source import DemoSource
-from predmapnet.errors import UserError
+from predmapnet.errors import value_errors_told
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
@@ -27,6 +30,7 @@ from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.mapping import MapSnapshot, Observer, SceneRun, Step, map_scene
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
+from predmapnet.runs.guarded_truth import GuardedTruth
 from predmapnet.runs.outputs import Outputs
 from predmapnet.scenes import Progress, Scene, SceneSource
 from predmapnet.sources import open_source
@@ -82,6 +86,7 @@ class SceneReport:
         rejections: of the integrator, counted by reason.
         accuracy: None without ground truth.
         written: the files.
+        notes: for the user: a place that is not known, ground truth that cannot be used.
     """
 
     scene: str
@@ -95,6 +100,7 @@ class SceneReport:
     rejections: Mapping[str, int]
     accuracy: Accuracy | None
     written: tuple[Path, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -121,12 +127,18 @@ class MappingPipeline:
     """
 
     def __init__(
-        self, source: SceneSource, mapper: Mapper, sentence: str = "", allow_missing_cameras: bool = False
+        self,
+        source: SceneSource,
+        mapper: Mapper,
+        sentence: str = "",
+        allow_missing_cameras: bool = False,
+        origin: LocalPlane | None = None,
     ) -> None:
         self.source = source
         self.mapper = mapper
         self.sentence = sentence
         self._allow_missing_cameras = allow_missing_cameras
+        self._origin = origin
 
     @classmethod
     def open(
@@ -135,14 +147,15 @@ class MappingPipeline:
         data_root: Path | None = None,
         network: NetworkOptions | None = None,
         allow_missing_cameras: bool = False,
+        origin: LocalPlane | None = None,
     ) -> MappingPipeline:
-        """Choose the source and load the network.
+        """Choose the source and load the network; ``origin`` says where the logs' frame lies, if the user knows.
 
         Raises:
             UserError: the data set or the weights are missing or broken.
         """
         source, sentence = open_source(dataset, data_root)
-        return cls(source, Mapper.from_checkpoint(network), sentence, allow_missing_cameras)
+        return cls(source, Mapper.from_checkpoint(network), sentence, allow_missing_cameras, origin)
 
     def run(
         self,
@@ -167,14 +180,13 @@ class MappingPipeline:
         """
         outputs.check()
         start = perf_counter()
-        scene = self.source.open(scene_name, preparing)
+        scene = GuardedTruth(self.source.open(scene_name, preparing))
         preparing_seconds = perf_counter() - start
         provenance = self.provenance(scene)
         torch.manual_seed(SEED)
-        georeference = scene.georeference
-        if georeference is None:
-            where = scene.info.location
-            raise UserError(f"{scene_name} cannot be mapped: the location '{where}' has no known place on Earth")
+        georeference, notes = self._place(scene)
+        if isinstance(georeference, LocalFrame):
+            provenance[LOCAL_FRAME] = georeference.frame
         with ExitStack() as files:
             observers: list[Observer] = []
             if viewer is not None:
@@ -188,13 +200,36 @@ class MappingPipeline:
             run = map_scene(scene, self.mapper, observers, self._allow_missing_cameras)
             if outputs.map is not None:
                 observed = observed_rings(run.observed, georeference)
-                write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
+                with value_errors_told():
+                    write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
             if outputs.frames is not None:
                 pairs = zip(run.frames, run.frame_maps, strict=True)
                 stored = (StoredFrame(frame.scene, frame.index, frame.token, mapped) for frame, mapped in pairs)
                 write_frames(outputs.frames, stored, provenance)
-        accuracy = measure(scene, run, self.mapper.roi)
-        return MappedScene(run, _report(scene, run, accuracy, preparing_seconds, outputs))
+        accuracy = scene.guarded(lambda: measure(scene, run, self.mapper.roi))
+        if scene.problem:
+            accuracy = None
+            notes += (f"the map could not be compared with the ground truth: {scene.problem}",)
+        return MappedScene(run, _report(scene, run, accuracy, preparing_seconds, outputs, notes))
+
+    def _place(self, scene: Scene) -> tuple[Georeference, tuple[str, ...]]:
+        """Return where a scene's frame lies, and a note if nobody knows. Raises UserError for a place that cannot be.
+
+        A frame whose place is not known becomes a local one.
+        """
+        position = scene.instant(0).ego_to_global[:2, 3]
+        georeference = self._origin or scene.georeference
+        notes: tuple[str, ...] = ()
+        if georeference is None:
+            where = scene.info.location
+            georeference = local_frame(where if where not in ("", "unknown") else scene.info.name, position)
+            notes = (
+                f"the place of {scene.info.name} on Earth is not known (location '{where}'): the map is in metres "
+                "about longitude 0 and latitude 0. --origin latitude,longitude says where the frame of the poses lies",
+            )
+        with value_errors_told():
+            georeference.to_wgs84(position[None])
+        return georeference, notes
 
     def provenance(self, scene: Scene) -> dict[str, Any]:
         """Return the provenance of a scene's map, as written into it. It names no path of this machine."""
@@ -286,7 +321,12 @@ Weights {provenance["weights_sha256"][:12]}
 
 
 def _report(
-    scene: Scene, run: SceneRun, accuracy: Accuracy | None, preparing_seconds: float, outputs: Outputs
+    scene: Scene,
+    run: SceneRun,
+    accuracy: Accuracy | None,
+    preparing_seconds: float,
+    outputs: Outputs,
+    notes: tuple[str, ...],
 ) -> SceneReport:
     return SceneReport(
         scene=scene.info.name,
@@ -300,4 +340,5 @@ def _report(
         rejections=run.rejections,
         accuracy=accuracy,
         written=outputs.paths,
+        notes=notes,
     )

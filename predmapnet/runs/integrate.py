@@ -13,11 +13,11 @@ import shapely
 from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
 from mapfusion.ground import seen_along
 from predmapnet.errors import UserError
-from predmapnet.frame_files.maptr import read_detections, turned
+from predmapnet.frame_files.maptr import read_detections
 from predmapnet.frame_files.parquet import read_frames
 from predmapnet.frame_files.pose_file import FramePose, read_poses
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name
-from predmapnet.mapping import NETWORK_ERRORS
+from predmapnet.mapping import NETWORK_ERRORS, check_left_out
 
 NAMED = 3
 """Number of tokens that a message names."""
@@ -62,6 +62,7 @@ def integrate_file(
     roi: RegionOfInterest | None = None,
     min_score: float = 0.4,
     y_forward: bool = False,
+    normalised: bool = False,
 ) -> Integration:
     """Read per-frame results and fuse them.
 
@@ -71,6 +72,7 @@ def integrate_file(
         roi: region that the detector looked at, for JSON; 60 m x 30 m without.
         min_score: elements below are left out where the file has no track ids, since nothing has picked them.
         y_forward: the file's x points right and its y forward, as MapTR's on nuScenes.
+        normalised: points are shares of the region's sides, from 0 to 1, instead of metres.
 
     Raises:
         UserError: a file that cannot be read, tokens without poses, points that cannot be metres of the ego frame.
@@ -86,11 +88,10 @@ def integrate_file(
     else:
         if poses is None:
             raise UserError(f"{frames} holds no poses: give them with --poses poses.json or --poses poses.csv.")
-        submitted = read_detections(frames)
-        known = read_poses(poses)
-        if y_forward:
-            submitted = {token: turned(frame) for token, frame in submitted.items()}
-        logged = _placed(frames, poses, submitted, known, roi or RegionOfInterest(), min_score, notes)
+        region = roi or RegionOfInterest()
+        submitted = read_detections(frames, notes, region if normalised else None, y_forward)
+        known = read_poses(poses, notes)
+        logged = _placed(frames, poses, submitted, known, region, min_score, notes)
     location, synthetic = str(provenance.get("location", "")), bool(provenance.get("synthetic"))
     return replace(integrate_frames(logged), notes=tuple(notes), location=location, synthetic=synthetic)
 
@@ -111,6 +112,7 @@ def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
         integrator.add(frame.frame_map, frame.log)
         if integrator.frames > before:
             fused.append(frame.frame_map)
+    check_left_out(len(ordered), len(fused), integrator.rejections)
     logs = tuple(dict.fromkeys(frame.log for frame in ordered))
     return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), seen_along(fused))
 

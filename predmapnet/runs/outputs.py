@@ -31,8 +31,9 @@ class Outputs:
 
     def check(self) -> None:
         """Check before the work begins that all of them can be written. Raises UserError."""
-        for path in self.paths:
-            check_output(path)
+        for path, endings in ((self.map, ()), (self.recording, (".rrd",)), (self.frames, (".parquet",))):
+            if path is not None:
+                check_output(path, endings)
         if len({path.absolute() for path in self.paths}) < len(self.paths):
             raise UserError("two outputs have the same name; give each its own")
         if self.map is not None:

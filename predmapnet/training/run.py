@@ -65,7 +65,7 @@ class RunOptions:
     device: str = "cpu"
 
 
-def train(options: RunOptions, report: Report = print) -> Path | None:
+def train_network(options: RunOptions, report: Report = print) -> Path | None:
     """Prepare the data, train, and write the averaged weights.
 
     Returns:

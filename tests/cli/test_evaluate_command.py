@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,3 +166,43 @@ def test_what_cannot_be_measured_is_said_in_one_message(predmapnet, tiny_root, t
     assert not (tmp_path / "f.json").exists()
     result = predmapnet("evaluate", tmp_path / "other.parquet", "--data-root", tiny_root, "--roi", "100x50")
     assert result.code == 2 and "--roi is for submissions" in result.err
+
+
+def test_mixtures_and_other_axes_are_refused(predmapnet, tiny_root, tmp_path):
+    scene, maps = truth_as_results(tiny_root, "scene-0001")
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_frames(folder / "scene-0001.parquet", stored(maps, "scene-0001"), {"weights_sha256": "a"})
+    other = stored(truth_as_results(tiny_root, "scene-0002")[1], "scene-0002")
+    write_frames(folder / "scene-0002.parquet", other, {"weights_sha256": "b"})
+    write_frames(tmp_path / "foreign.parquet", stored(maps, "scene-0001"), {"dataset": "argoverse2"})
+    wide = [replace(maps[0], roi=RegionOfInterest(100.0, 50.0)), *maps[1:]]
+    write_frames(tmp_path / "regions.parquet", stored(wide, "scene-0001"), {})
+    turned = [[[y, x] for x, y in np.array([[-28.0, -14.0], [0.0, 9.0], [29.0, 14.0]])] for _ in range(5)]
+    entry = {"vectors": turned, "scores": [0.5] * 5, "labels": [1] * 5}
+    (tmp_path / "turned.json").write_text(json.dumps({"results": {scene.frame(0).token: entry}}))
+    for results, message in (
+        (folder, "different weights"),
+        (tmp_path / "foreign.parquet", "made of argoverse2, not of nuscenes"),
+        (tmp_path / "regions.parquet", "mixes frames of 2 regions"),
+        (tmp_path / "turned.json", "(x, y) becomes (y, -x)"),
+    ):
+        result = predmapnet("evaluate", results, "--data-root", tiny_root)
+        assert result.code == 2 and message in " ".join(result.err.split()), result.err
+
+
+def test_what_was_measured_and_what_is_missing_is_said_and_written(predmapnet, tiny_root, tmp_path):
+    _, maps = truth_as_results(tiny_root, "scene-0001")
+    write_frames(tmp_path / "frames.parquet", stored(maps, "scene-0001")[:-1], {})
+    arguments = ["--data-root", tiny_root, "--json", tmp_path / "f.json", "--report", tmp_path / "r.html"]
+    result = predmapnet("evaluate", tmp_path / "frames.parquet", *arguments)
+    assert result.code == 0, result.err
+    assert "1 of 2 scenes, 60 m x 30 m" in result.out
+    assert f"1 of {len(maps)} frames are not in the results" in " ".join(result.err.split())
+    content = json.loads((tmp_path / "f.json").read_text())
+    evaluated = content["evaluated"]
+    assert evaluated["roi_m"] == [60.0, 30.0] and evaluated["scenes_in_split"] == 2
+    assert any("not comparable with all of them" in text for text in evaluated["warnings"])
+    assert any("no forecasts" in text for text in evaluated["missing"])
+    assert list(content["per_scene"]) == ["scene-0001"] and content["per_scene"]["scene-0001"]["frames"] == len(maps)
+    assert "predmapnet evaluate" in (tmp_path / "r.html").read_text()

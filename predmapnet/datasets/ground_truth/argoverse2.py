@@ -76,14 +76,15 @@ class Argoverse2GroundTruth:
                 for record in content["pedestrian_crossings"].values()
             ]
             areas = [_points(record["area_boundary"]) for record in content["drivable_areas"].values()]
+            areas = [points for points in areas if len(points) >= 3]  # fewer enclose nothing
             self._index_lanes(lanes)
-        except (KeyError, TypeError, AttributeError, ValueError, shapely.GEOSException) as error:
+            self._crossings = np.array([Polygon(points) for points in crossings], dtype=object)
+            drivable = np.array([Polygon(points) for points in areas], dtype=object)
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError, shapely.GEOSException) as error:
             raise UserError(
                 f"{name} is not an Argoverse 2 vector map ({type(error).__name__}: {error}). Fetch the log again."
             ) from None
-        self._crossings = np.array([Polygon(points) for points in crossings], dtype=object)
         self._crossing_tree = STRtree(self._crossings)
-        drivable = np.array([Polygon(points) for points in areas], dtype=object)
         self._drivable = drivable[shapely.is_valid(drivable)] if len(drivable) else drivable
         self._drivable_tree = STRtree(self._drivable)
         self._chains: dict[tuple[int, ...], list[LineString]] = {}
@@ -232,7 +233,14 @@ def _side(lane: Mapping[str, Any], points: Float, which: str) -> LaneSide | None
 
 
 def _points(records: Sequence[Mapping[str, float]]) -> Float:
-    return np.array([(point["x"], point["y"], point["z"]) for point in records], dtype=np.float64)
+    """Return ``(n, 3)`` points. Heights that are NaN, as in some published maps, become the mean of the others."""
+    points = np.array([(point["x"], point["y"], point["z"]) for point in records], dtype=np.float64).reshape(-1, 3)
+    heights = np.isfinite(points[:, 2])
+    if not heights.all():
+        points[~heights, 2] = points[heights, 2].mean() if heights.any() else 0.0
+    if not np.isfinite(points).all():
+        raise ValueError("a point is not finite")
+    return points
 
 
 def _moved(geometries: NDArray[Any], pose: Float) -> NDArray[Any]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import orjson
 
+from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
 
 
@@ -28,11 +29,9 @@ def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], 
         return source, hashlib.sha256(orjson.dumps(source)).digest()
     try:
         data = source.read_bytes()
-        content = orjson.loads(data)
     except OSError as error:
         raise UserError(f"Cannot read the map {source}: {error.strerror}.") from None
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{source} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
+    content = parse_json(data, source)
     if not isinstance(content, dict):
         raise UserError(f"{source} is not a map: it must be one JSON object.")
     return content, hashlib.sha256(data).digest()

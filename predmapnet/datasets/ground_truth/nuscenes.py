@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -66,13 +67,15 @@ class NuScenesGroundTruth:
         self.keep_corners = keep_corners
         self.fingerprint = digest + bytes([keep_corners])
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
+        if not isinstance(map_file, Mapping):
+            check_version(content, name)
         try:
-            nodes = {node["token"]: (node["x"], node["y"]) for node in content["node"]}
+            nodes = {node["token"]: _position(node) for node in content["node"]}
             lines = {line["token"]: line["node_tokens"] for line in content["line"]}
             polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
             self._index(
                 dividers=[
-                    LineString([nodes[token] for token in lines[record["line_token"]]])
+                    _line([nodes[token] for token in lines[record["line_token"]]])
                     for layer in ("road_divider", "lane_divider")
                     for record in content[layer]
                 ],
@@ -80,7 +83,7 @@ class NuScenesGroundTruth:
                 road_segments=_polygons(content["road_segment"], polygons, nodes),
                 lanes=_polygons(content["lane"], polygons, nodes),
             )
-        except (KeyError, TypeError, shapely.GEOSException, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, IndexError, shapely.GEOSException, ValueError) as error:
             raise UserError(
                 f"{name} is not a nuScenes map expansion of version 1.3 ({type(error).__name__}: {error}). "
                 "Fetch the map expansion again and unpack it into maps/expansion."
@@ -239,6 +242,21 @@ class _Place:
         return np.asarray(points @ self._turn[:, :2] + self._centre)
 
 
+def check_version(content: Mapping[str, Any], name: str) -> None:
+    """Refuse an old map expansion as the official devkit does: its maps lie elsewhere, or lack layers.
+
+    Raises:
+        UserError: the version is below 1.3, or there is none.
+    """
+    version = str(content.get("version", "1.0"))
+    if re.fullmatch(r"\d+(\.\d+)*", version) is None or tuple(map(int, version.split("."))) < (1, 3):
+        found = f"version {version}" if "version" in content else "no version"
+        raise UserError(
+            f"{name} is an outdated map expansion ({found}); version 1.3 is expected. Fetch the map expansion again "
+            "from nuscenes.org and unpack it into maps/expansion."
+        )
+
+
 class _Layer:
     """Geometries of one map layer with their spatial index; invalid ones are never found."""
 
@@ -268,5 +286,20 @@ def _polygons(
         polygon = polygons[record["polygon_token"]]
         holes = [[nodes[token] for token in hole["node_tokens"]] for hole in polygon["holes"]]
         exterior = [nodes[token] for token in polygon["exterior_node_tokens"]]
+        if len(exterior) < 3:
+            result.append(Polygon())
+            continue
         result.append(Polygon(exterior, [hole for hole in holes if hole]))
     return result
+
+
+def _position(node: Mapping[str, Any]) -> tuple[float, float]:
+    x, y = float(node["x"]), float(node["y"])
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise ValueError(f"the node {node['token']} is not finite")
+    return x, y
+
+
+def _line(points: Sequence[tuple[float, float]]) -> LineString:
+    """Return a line; one of a single node is empty, and stays for its index."""
+    return LineString(points if len(points) > 1 else [])

@@ -69,5 +69,6 @@ def mask_iou(first: Mask, second: Mask) -> Float:
 def _packed(masks: Mask) -> NDArray[np.uint64]:
     """``(n, pixels)`` of 0 and 1 as ``(n, words)`` of 64 pixels each."""
     packed = np.packbits(masks, axis=1)
-    padding = -packed.shape[1] % 8
-    return np.ascontiguousarray(np.pad(packed, ((0, 0), (0, padding)))).view(np.uint64)
+    words = np.zeros((len(packed), -(-packed.shape[1] // 8)), dtype=np.uint64)
+    words.view(np.uint8)[:, : packed.shape[1]] = packed
+    return words

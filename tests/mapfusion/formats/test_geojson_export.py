@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.geojson import format_timestamp, parse_timestamp, read_geojson, write_geojson
+from mapfusion.formats.foreign_values import format_timestamp, parse_timestamp
+from mapfusion.formats.geojson import read_geojson, write_geojson
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,7 @@ def test_round_trip_keeps_everything(tmp_path):
     st.floats(0, 1),
 )
 def test_any_line_comes_back_within_a_millimetre(tmp_path_factory, points, stamp, confidence):
+    assume(np.ptp(np.array(points), axis=0).max() > 1e-3)  # lines without length are left out
     path = tmp_path_factory.mktemp("lines") / "map.geojson"
     element = line(points, first_seen=stamp, last_seen=stamp, confidence=confidence)
     write_geojson(GlobalMap((element,)), path, TOWN)

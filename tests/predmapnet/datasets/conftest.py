@@ -33,7 +33,7 @@ def square(x, y, width, height):
 def map_expansion():
     """A straight road along x with two lanes, one divider, one crossing and a kerbed island beside it."""
     content = {name: [] for name in ("node", "line", "polygon", "road_segment", "lane", "ped_crossing")}
-    content |= {"road_divider": [], "lane_divider": []}
+    content |= {"version": "1.3", "road_divider": [], "lane_divider": []}
 
     def nodes(points):
         tokens = [f"n{len(content['node']) + number}" for number in range(len(points))]

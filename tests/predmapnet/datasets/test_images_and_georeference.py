@@ -1,14 +1,19 @@
 """Damaged images are noticed; metres become the right longitude and latitude."""
 
+import struct
+
 import cv2
 import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
+from mapfusion.formats.local_plane import LocalPlane
 from predmapnet.datasets.georeference import (
     NUSCENES_ORIGINS,
     argoverse2_georeference,
     demo_georeference,
+    given_origin,
+    local_frame,
     nuscenes_georeference,
 )
 from predmapnet.datasets.images import read_image
@@ -81,3 +86,65 @@ def test_demo_towns_lie_in_the_open_ocean_and_never_overlap():
     # The nearest land of Point Nemo is 2,688 km away.
     distances = Geod(ellps="WGS84").inv(*np.broadcast_arrays(-123.3933, -48.8767, *boxes[:, 0].T))[2]
     assert max(distances) < 400_000
+
+
+def with_orientation(jpeg, orientation):
+    """Put an EXIF orientation into a JPEG."""
+    body = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + struct.pack("<HHIHH", 0x112, 3, 1, orientation, 0) + bytes(4)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
+
+
+@pytest.fixture
+def jpeg():
+    """A picture with some structure."""
+    picture = np.random.default_rng(5).integers(0, 255, (60, 100, 3), dtype=np.uint8)
+    return cv2.imencode(".jpg", picture)[1].tobytes()
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_taken_as_stored_whatever_the_exif_orientation(tmp_path, jpeg, orientation):
+    (tmp_path / "plain.jpg").write_bytes(jpeg)
+    (tmp_path / "turned.jpg").write_bytes(with_orientation(jpeg, orientation))
+    np.testing.assert_array_equal(read_image(tmp_path / "turned.jpg"), read_image(tmp_path / "plain.jpg"))
+
+
+def test_padding_after_the_end_of_a_jpeg_does_not_matter(tmp_path, jpeg):
+    (tmp_path / "padded.jpg").write_bytes(jpeg + bytes(5000))
+    assert read_image(tmp_path / "padded.jpg").shape == (60, 100, 3)
+
+
+def test_a_thumbnail_does_not_hide_that_a_jpeg_is_cut_short(tmp_path, jpeg):
+    thumbnail = b"\xff\xe1" + struct.pack(">H", len(jpeg) + 2) + jpeg
+    (tmp_path / "short.jpg").write_bytes(jpeg[:2] + thumbnail + jpeg[2 : len(jpeg) // 2])
+    with pytest.raises(UserError, match="cut short"):
+        read_image(tmp_path / "short.jpg")
+
+
+def test_a_jpeg_that_is_damaged_in_the_middle_is_named(tmp_path, jpeg):
+    middle = len(jpeg) // 2
+    (tmp_path / "damaged.jpg").write_bytes(jpeg[:middle] + bytes([0xFF, 0x42]) * 50 + jpeg[middle + 100 :])
+    with pytest.raises(UserError, match=r"damaged\.jpg is damaged at byte"):
+        read_image(tmp_path / "damaged.jpg")
+
+
+def test_a_local_frame_takes_off_large_coordinates_and_lies_where_no_road_is():
+    position = np.array([458_123.0, 5_428_321.0])
+    frame = local_frame("my-town", position)
+    points = position + np.array([[0.0, 0.0], [30.0, 40.0]])
+    degrees = frame.to_wgs84(points)
+    assert np.abs(degrees).max() < 1.0
+    metres = LocalPlane(0.0, 0.0).from_wgs84(degrees)
+    assert np.linalg.norm(metres[1] - metres[0]) == pytest.approx(50.0, abs=1e-6)
+    assert local_frame("my-town", position + 100.0) == frame
+
+
+@pytest.mark.parametrize("georeference", [nuscenes_georeference("boston-seaport"), argoverse2_georeference("PIT")])
+def test_points_of_another_frame_are_refused(georeference):
+    with pytest.raises(ValueError, match="km from the origin"):
+        georeference.to_wgs84(np.array([[458_123.0, 5_428_321.0]]))
+
+
+@pytest.mark.parametrize("text", ["49", "north,east", "95,8", "49,181", "nan,nan"])
+def test_an_origin_that_is_no_place_is_refused(text):
+    with pytest.raises(UserError, match="--origin"):
+        given_origin(text)

@@ -37,5 +37,5 @@ def test_an_argoverse_sweep_is_in_the_ego_frame_already(tmp_path):
 def test_a_table_without_coordinates_is_no_sweep(tmp_path):
     path = tmp_path / "1.feather"
     feather.write_feather(pa.table({"x": np.zeros(2), "intensity": np.zeros(2)}), path)
-    with pytest.raises(UserError, match="no column y, z"):
+    with pytest.raises(UserError, match="lacks the columns y, z"):
         read_argoverse2_sweep(path)

@@ -165,9 +165,9 @@ def test_a_wrong_scene_name_offers_the_nearest(nuscenes_root):
 
 def test_a_damaged_map_is_an_error_and_a_missing_one_is_not(nuscenes_root):
     path = nuscenes_root / "maps" / "expansion" / "singapore-onenorth.json"
-    path.write_text('{"node": []}')
+    path.write_text('{"version": "1.3", "node": []}')
     with pytest.raises(UserError, match=r"singapore-onenorth\.json is not a nuScenes map expansion"):
-        NuScenesSource(nuscenes_root).open("scene-0061")
+        NuScenesSource(nuscenes_root).open("scene-0061").truth_map()
     path.unlink()
     scene = NuScenesSource(nuscenes_root).open("scene-0061")
     assert scene.truth(0, RegionOfInterest()) is None

@@ -8,7 +8,6 @@ import pytest
 from shapely import box
 
 from mapfusion.elements import RegionOfInterest
-from predmapnet.demo_world.av2_dressing import read_log
 from predmapnet.demo_world.catalogue import build_world
 from predmapnet.demo_world.render.lidar import RANGE, scan
 from predmapnet.demo_world.render.renderer import Renderer
@@ -18,6 +17,7 @@ from predmapnet.demo_world.street.traffic import footprint
 from predmapnet.demo_world.world import Look
 from predmapnet.scenes import Camera
 from tests.predmapnet.demo_world.occlusion import hidden_share
+from tests.real_roads.argoverse_logs import read_log
 
 SMALL_RIG = tuple(
     Camera(camera.name, 256, 144, np.diag([0.32, 0.32, 1.0]) @ camera.intrinsics, camera.camera_to_ego)
@@ -102,7 +102,9 @@ def test_a_real_argoverse_log_can_be_dressed_and_rendered():
     logs = sorted(path.parent for path in (root / "ground_truth/av2/logs").glob("*/calibration"))
     if not logs:
         pytest.skip(f"no Argoverse 2 log with calibration under {root}; set PREDMAPNET_REFERENCE")
-    vector_map, trajectory, rig = read_log(logs[0])
+    logged = read_log(logs[0])
+    vector_map, trajectory, rig = logged.vector_map, logged.trajectory, logged.rig
+    assert rig is not None
     assert len(vector_map.dividers) > 0 and len(vector_map.road_segments) > 0 and len(rig) == 7
     renderer = Renderer(dress(vector_map, trajectory, Look.DAY, 3, "log"), supersampling=1)
     front = next(camera for camera in rig if camera.name == "ring_front_center")

@@ -174,7 +174,7 @@ NORMALISED = {"vectors": [[[0.1, 0.2], [0.3, 0.4]]] * 10, "scores": [1] * 10, "l
             r"vector 0 has the shape \(3,\)",
         ),
         ('{"results": {"t": {"vectors": [[[1], [2]]], "scores": [1], "labels": [0]}}}', "vector 0 has the shape"),
-        ('{"results": {"t": {"vectors": [[1, 2]], "scores": [1], "labels": ["divider"]}}}', "labels are not numbers"),
+        ('{"results": {"t": {"vectors": [[1, 2]], "scores": [1], "labels": [{}]}}}', "labels are not numbers"),
         ('{"results": {"t": {"vectors": [[1, 2]], "scores": [1], "labels": [0.5]}}}', "not all whole numbers"),
         ('[{"vectors": [], "scores": [], "labels": []}]', "entry 0: .* scene_name and local_idx"),
         ([{"scene_name": "s", "local_idx": 0, "vectors": [], "scores": [], "labels": []}] * 2, "s/0 twice"),

@@ -18,7 +18,7 @@ from predmapnet.training import run_checkpoint
 from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.run import RunOptions, train
+from predmapnet.training.run import RunOptions, train_network
 from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings
 from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
@@ -144,7 +144,7 @@ def test_a_gpu_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Pa
     common = {"config": tiny_config(), "data": "demo", "folder": tmp_path / "run", "cache": tmp_path / "cache"}
     sizes = {"towns": 1, "validation_towns": 1, "processes": 1, "threads": 1}
     with pytest.raises(UserError, match="no device cuda"):
-        train(RunOptions(**common, **sizes, settings=SETTINGS, device="cuda"))
+        train_network(RunOptions(**common, **sizes, settings=SETTINGS, device="cuda"))
     assert not list(tmp_path.iterdir())
 
 
@@ -161,6 +161,6 @@ def test_weights_that_do_not_fit_are_refused_before_anything_is_rendered(
         (tiny_config(), "new", {"initial": tmp_path / "absent.safetensors"}, "absent"),
     ):
         with pytest.raises(UserError, match=says) as caught:
-            train(RunOptions(**common, **sizes, config=config, folder=tmp_path / folder, **start))
+            train_network(RunOptions(**common, **sizes, config=config, folder=tmp_path / folder, **start))
         assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.argoverse2 import KEY_FRAME_STRIDE, Argoverse2Scene, Argoverse2Source
 from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
@@ -78,30 +79,45 @@ def vector_map_of(archive: Mapping[str, Any]) -> VectorMap:
     return VectorMap(tuple(parts), tuple(lanes), tuple(crossings), tuple(dividers.values()))
 
 
-def read_log(folder: Path, stride: int = 5) -> tuple[VectorMap, Trajectory, Rig]:
-    """Read what the renderer needs of a log: real map, real ego motion, real calibration.
+@dataclass(frozen=True)
+class LoggedDrive:
+    """What the renderer needs of a log, and the log itself, which knows the official truth.
 
-    The road of the demo world is the plane z = 0; so heights, pitch and roll are dropped, and the car drives with its
-    rear axle 0.33 m above the plane. Lens distortion is left out: the cameras are pinholes with the real intrinsics.
+    Attributes:
+        vector_map: the real map, heights dropped.
+        trajectory: the real ego motion on the plane z = 0, without pitch and roll. The ego origin, the middle of the
+            rear axle, moves :data:`REAR_AXLE_HEIGHT` above it.
+        rig: the real cameras, or None for a log without calibration. Lens distortion is left out: they are pinholes
+            with the real intrinsics.
+        log: frames of the log in the order of the trajectory.
+    """
+
+    vector_map: VectorMap
+    trajectory: Trajectory
+    rig: Rig | None
+    log: Argoverse2Scene
+
+
+def read_log(folder: Path, stride: int = KEY_FRAME_STRIDE) -> LoggedDrive:
+    """Read what the renderer needs of a log: real map, real ego motion, real calibration.
 
     Args:
         folder: the log's folder, as Argoverse 2 names it.
         stride: take every so many lidar sweeps (10 Hz).
 
     Raises:
-        UserError: the log has no map or no calibration, or a file is broken.
+        UserError: the log has no map, or a file is broken.
     """
-    scene = Argoverse2Source(folder.parent, stride=stride).open(folder.name)
+    log = Argoverse2Source(folder.parent, stride=stride).open(folder.name)
     archives = sorted((folder / "map").glob("log_map_archive_*.json"))
     if not archives:
         raise UserError(f"{folder / 'map'} holds no log_map_archive_*.json, so there is no map to dress.")
     archive, _ = read_map_file(archives[0])
-    poses = np.tile(np.eye(4), (len(scene), 1, 1))
-    timestamps = np.empty(len(scene), dtype=np.int64)
-    for index in range(len(scene)):
-        pose = scene.pose(index)
+    poses = np.tile(np.eye(4), (len(log), 1, 1))
+    for index in range(len(log)):
+        pose = log.pose(index)
         yaw = np.arctan2(pose[1, 0], pose[0, 0])
         poses[index, :2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         poses[index, :3, 3] = pose[0, 3], pose[1, 3], REAR_AXLE_HEIGHT
-        timestamps[index] = scene.timestamps[index]
-    return vector_map_of(archive), Trajectory(timestamps, poses), scene.rig
+    rig = log.rig if (folder / "calibration").is_dir() else None
+    return LoggedDrive(vector_map_of(archive), Trajectory(log.timestamps.copy(), poses), rig, log)

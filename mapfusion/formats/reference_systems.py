@@ -1,0 +1,73 @@
+"""Coordinate reference systems of map files that other programs wrote: the way to longitude and latitude (WGS84)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from mapfusion.arrays import Float
+
+ON_THE_GLOBE = np.array([180.0, 90.0])
+
+
+class ToDegrees:
+    """Transformation of positions of a reference system to longitude and latitude, degrees (WGS84).
+
+    Args:
+        name: of the system, as the file gives it: an EPSG code, a URN or WKT.
+        where: file and layer, for the message.
+
+    Raises:
+        ValueError: PROJ knows no such system, or no way from it to WGS84.
+    """
+
+    def __init__(self, name: str, where: str) -> None:
+        self._where = where
+        try:
+            self._transformer = _transformer(name)
+        except ValueError as error:
+            raise ValueError(
+                f"{where}: its coordinate reference system cannot be turned into longitude and latitude ({error}). "
+                "Save it in WGS84 (EPSG:4326)"
+            ) from error
+
+    def positions(self, positions: Float) -> Float:
+        """Map ``(n, 2)`` positions of the system to ``(n, 2)`` degrees; raises ValueError for those off the globe."""
+        if self._transformer is None:
+            degrees = positions
+        else:
+            degrees = np.stack(self._transformer.transform(positions[:, 0], positions[:, 1]), axis=1)
+        if not (np.abs(degrees) <= ON_THE_GLOBE).all():  # False for NaN, too
+            first = positions[int(np.argmin((np.abs(degrees) <= ON_THE_GLOBE).all(axis=1)))]
+            raise ValueError(
+                f"{self._where}: positions such as {first.tolist()} are not longitude and latitude in degrees (WGS84)"
+            )
+        return degrees
+
+    def box(self, box: Sequence[float]) -> list[float]:
+        """Map west, south, east and north of the system to degrees."""
+        if self._transformer is None:
+            return list(box)
+        return list(self._transformer.transform_bounds(*box))
+
+
+@lru_cache(maxsize=16)
+def _transformer(name: str) -> Any:
+    """Return the transformer of a system, None for longitude and latitude themselves; raises ValueError."""
+    if not name.strip():
+        raise ValueError("it names none")
+    if name in ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84"):
+        return None
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import ProjError
+
+    try:
+        system, degrees = CRS.from_user_input(name), CRS.from_epsg(4326)
+        if system.equals(degrees, ignore_axis_order=True):
+            return None
+        return Transformer.from_crs(system, degrees, always_xy=True)
+    except ProjError as error:
+        raise ValueError(f"{name[:60]!r} is unknown to PROJ") from error

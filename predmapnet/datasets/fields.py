@@ -1,0 +1,61 @@
+"""Fields of foreign records, checked: what a file lacks or holds in another form is told with file, place and field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mapfusion.arrays import Float
+from predmapnet.errors import UserError
+
+
+def text_field(record: Mapping[str, Any], name: str, where: str) -> str:
+    """Return a field that is a text. Raises UserError if it is missing or something else."""
+    value = record.get(name)
+    if not isinstance(value, str):
+        raise _wrong(record, name, "a text", where)
+    return value
+
+
+def whole_field(record: Mapping[str, Any], name: str, where: str) -> int:
+    """Return a field that is an integer. Raises UserError if it is missing or something else."""
+    value = record.get(name)
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or value != value // 1:
+        raise _wrong(record, name, "a whole number", where)
+    return int(value)
+
+
+def numbers_field(record: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> Float:
+    """Return a field that holds finite numbers of a shape. Raises UserError if it is missing or something else."""
+    try:
+        numbers = np.array(record.get(name), dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise _wrong(record, name, " x ".join(map(str, shape)) + " finite numbers", where)
+    return numbers
+
+
+def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> UserError:
+    found = f"is {str(record[name])[:60]!r}" if record.get(name) is not None else "is missing"
+    token = record.get("token")
+    which = f", record {str(token)[:60]}" if token is not None else ""
+    return UserError(f"{where}{which}: the field '{name}' {found}; {expected} is expected.")
+
+
+def check_principal_point(intrinsics: Float, width: int, height: int, where: str) -> None:
+    """Raise UserError if a camera's principal point lies outside of its image: they are of different sizes.
+
+    Args:
+        intrinsics: ``(3, 3)``.
+        width, height: pixels of the image.
+        where: file and camera, for the message.
+    """
+    x, y = float(intrinsics[0, 2]), float(intrinsics[1, 2])
+    if not (0.0 < x < width and 0.0 < y < height) or not (intrinsics[[0, 1], [0, 1]] > 0.0).all():
+        raise UserError(
+            f"{where}: the intrinsics (focal lengths {intrinsics[0, 0]:g} and {intrinsics[1, 1]:g}, principal point "
+            f"{x:g}, {y:g}) are not those of images of {width} x {height} pixels. Were the images scaled?"
+        )
