@@ -21,7 +21,7 @@ class Scheme(StrEnum):
 Dataset = Annotated[
     str | None,
     typer.Option(
-        help="nuscenes, argoverse2 or demo; or set PREDMAPNET_DATASET. Default: the demo world.",
+        help="nuscenes, argoverse2, demo or demo-v1; or set PREDMAPNET_DATASET. Default: the demo world.",
     ),
 ]
 DataRoot = Annotated[

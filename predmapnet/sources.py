@@ -2,7 +2,7 @@
 
 Environment variables, each used only where the command line says nothing:
 
-* ``PREDMAPNET_DATASET``: ``nuscenes``, ``argoverse2`` or ``demo``.
+* ``PREDMAPNET_DATASET``: ``nuscenes``, ``argoverse2``, ``demo`` or ``demo-v1``.
 * ``PREDMAPNET_DATA_ROOT``: folder of the data set.
 * ``NUSCENES_ROOT``, ``AV2_ROOT``: the customary names of the field, looked at last.
 """
@@ -21,7 +21,7 @@ from predmapnet.demo_world.source import DemoSource
 from predmapnet.errors import UserError
 from predmapnet.scenes import SceneSource
 
-DATASETS = ("nuscenes", "argoverse2", "demo")
+DATASETS = ("nuscenes", "argoverse2", "demo", "demo-v1")
 ROOT_VARIABLES = {"nuscenes": "NUSCENES_ROOT", "argoverse2": "AV2_ROOT"}
 
 
@@ -34,7 +34,8 @@ def open_source(
     """Open a data set.
 
     Args:
-        dataset: ``nuscenes``, ``argoverse2`` or ``demo``; None asks the environment, then the folder itself.
+        dataset: ``nuscenes``, ``argoverse2``, ``demo`` or ``demo-v1``; None asks the environment, then the
+            folder itself.
         data_root: folder of the data set (for the demo world: its cache); None asks the environment.
         split_scheme: ``old`` (the data set's own splits) or ``new`` (StreamMapNet's geographically disjoint ones).
         official_frames: of Argoverse 2, take exactly the frames of the published benchmarks instead of counting the
@@ -64,9 +65,11 @@ def _open(
     root_text, root_from = _setting(data_root, "--data-root", "PREDMAPNET_DATA_ROOT")
     if dataset is not None and dataset not in DATASETS:
         raise UserError(f"{dataset_from} says '{dataset}', but the data sets are: {', '.join(DATASETS)}.")
-    if dataset == "demo":
-        source = DemoSource(None if root_text is None else Path(root_text).expanduser())
-        return source, f"Using the demo world (synthetic towns), as {dataset_from} says."
+    if dataset in ("demo", "demo-v1"):
+        cache = None if root_text is None else Path(root_text).expanduser()
+        if dataset == "demo-v1":
+            return DemoSource(cache, edition=1), f"Using the towns of the first demo world, as {dataset_from} says."
+        return DemoSource(cache), f"Using the demo world (synthetic towns), as {dataset_from} says."
     if root_text is None:
         dataset, dataset_from, root_text, root_from = _customary_root(dataset, dataset_from)
     if root_text is None:

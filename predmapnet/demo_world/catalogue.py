@@ -6,22 +6,27 @@ import difflib
 import os
 import re
 import sys
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from predmapnet.demo_world.town.routes import KEY_FRAMES, drive
+from predmapnet.demo_world.first_towns import first_town
+from predmapnet.demo_world.town.driving import KEY_FRAMES
+from predmapnet.demo_world.town.routes import NoDriveError, drive
 from predmapnet.demo_world.town.town import Town, build_town
 from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
-WORLD_VERSION = 1
+WORLD_VERSION = 2
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
 
-SPLITS: dict[str, range] = {"train": range(201, 601), "val": range(1, 11), "test": range(101, 111)}
+SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "test": range(101, 111)}
 """Scene numbers. Each scene has a town of its own whose seed is its number, so that no town is in two splits."""
+
+FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
+"""Scenes of the first world that are kept, so that networks can be compared with older ones."""
 
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """How often each look is drawn for a training scene."""
@@ -41,10 +46,16 @@ _TEN_LOOKS = (
 """Looks of the ten validation and the ten test scenes, in order: the same shares, and every look at least once."""
 
 
-def scene_infos(split: str | None = None) -> tuple[SceneInfo, ...]:
+def splits_of(edition: int = WORLD_VERSION) -> dict[str, range]:
+    """The scenes of an edition of the world: the present one has all, the first its test towns."""
+    return FIRST_SPLITS if edition == 1 else SPLITS
+
+
+def scene_infos(split: str | None = None, edition: int = WORLD_VERSION) -> tuple[SceneInfo, ...]:
     """List the scenes of one split, or of all. Raises UserError for a split that does not exist."""
-    if split is not None and split not in SPLITS:
-        raise UserError(f"The demo world has no split '{split}'. It has: {', '.join(SPLITS)}.")
+    splits = splits_of(edition)
+    if split is not None and split not in splits:
+        raise UserError(f"The demo world has no split '{split}'. It has: {', '.join(splits)}.")
     return tuple(
         SceneInfo(
             name=f"scene-{number:04d}",
@@ -54,19 +65,25 @@ def scene_infos(split: str | None = None) -> tuple[SceneInfo, ...]:
             ready=False,
             description=f"demo world, {look_of(f'scene-{number:04d}')}",
         )
-        for name, numbers in SPLITS.items()
+        for name, numbers in splits.items()
         if split in (None, name)
         for number in numbers
     )
 
 
-def scene_number(name: str) -> int:
+def scene_number(name: str, edition: int = WORLD_VERSION) -> int:
     """The number of a scene, which is the seed of its town. Raises UserError for a name that does not exist."""
-    names = {f"scene-{number:04d}": number for numbers in SPLITS.values() for number in numbers}
+    names = _numbers(edition)
     if name not in names:
         near = ", ".join(_nearest_names(name, names))
         raise UserError(f"The demo world has no scene '{name}'. The nearest names are: {near}.")
     return names[name]
+
+
+@cache
+def _numbers(edition: int) -> dict[str, int]:
+    """Scene numbers of an edition by name."""
+    return {f"scene-{number:04d}": number for numbers in splits_of(edition).values() for number in numbers}
 
 
 def _nearest_names(name: str, names: dict[str, int]) -> list[str]:
@@ -87,9 +104,20 @@ def look_of(name: str) -> Look:
 
 
 @lru_cache(maxsize=32)
+def _town_and_drive(number: int) -> tuple[Town, Trajectory]:
+    """The first town of a seed in which there is a drive; a plan can be too cramped for its streets or for a car."""
+    for attempt in range(8):
+        town = build_town(number, attempt)
+        try:
+            return town, drive(town, number)
+        except NoDriveError:
+            continue
+    raise NoDriveError(f"no town of seed {number} has a drive")
+
+
 def town_of(name: str) -> Town:
     """The town that a scene drives through."""
-    return build_town(scene_number(name))
+    return _town_and_drive(scene_number(name))[0]
 
 
 def vector_map(name: str) -> VectorMap:
@@ -99,14 +127,17 @@ def vector_map(name: str) -> VectorMap:
 
 def trajectory(name: str) -> Trajectory:
     """Where the car is at each key frame of a scene."""
-    return drive(town_of(name), scene_number(name))
+    return _town_and_drive(scene_number(name))[1]
 
 
-def build_world(name: str) -> World:
-    """Everything the renderer needs to draw a scene."""
+def build_world(name: str, edition: int = WORLD_VERSION) -> World:
+    """Everything the renderer needs to draw a scene, of the present world or of the first one (edition 1)."""
     from predmapnet.demo_world.street.dressing import dress
 
-    return dress(vector_map(name), trajectory(name), look_of(name), scene_number(name), name)
+    number = scene_number(name, edition)
+    if edition == 1:
+        return dress(*first_town(number), look_of(name), number, name)
+    return dress(vector_map(name), trajectory(name), look_of(name), number, name)
 
 
 def default_cache() -> Path:
@@ -119,18 +150,19 @@ def default_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "predmapnet"
 
 
-def scene_folder(name: str, cache: Path) -> Path:
+def scene_folder(name: str, cache: Path, edition: int = WORLD_VERSION) -> Path:
     """Where a scene lies as a nuScenes data set, whether it has been rendered or not."""
-    return cache / f"demo-world-v{WORLD_VERSION}" / name
+    return cache / f"demo-world-v{WORLD_VERSION}{'-first-towns' if edition == 1 else ''}" / name
 
 
-def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Path:
+def ensure_scene(name: str, cache: Path, progress: Progress | None = None, edition: int = WORLD_VERSION) -> Path:
     """Render a scene unless that has been done.
 
     Args:
         name: for example ``scene-0103``.
         cache: the folder that holds all scenes.
         progress: called once per key frame.
+        edition: of the world; 1 has the towns of the first one, drawn as scenes are drawn today.
 
     Returns:
         The root of a nuScenes data set (``v1.0-mini``, ``samples``, ``maps``) with this one scene.
@@ -138,10 +170,10 @@ def ensure_scene(name: str, cache: Path, progress: Progress | None = None) -> Pa
     Raises:
         UserError: the scene does not exist, or the cache cannot be written.
     """
-    folder = scene_folder(name, cache)
-    scene_number(name)
+    folder = scene_folder(name, cache, edition)
+    scene_number(name, edition)
     if not folder.exists():
         from predmapnet.demo_world.nuscenes.writer import write_scene
 
-        write_scene(build_world(name), folder, WORLD_VERSION, progress=progress)
+        write_scene(build_world(name, edition), folder, WORLD_VERSION, progress=progress)
     return folder

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
-from predmapnet.demo_world.catalogue import default_cache, ensure_scene, scene_folder, scene_infos
+from predmapnet.demo_world.catalogue import WORLD_VERSION, default_cache, ensure_scene, scene_folder, scene_infos
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
@@ -16,22 +16,24 @@ class DemoSource:
     """Scenes of the demo world; each is rendered into the cache when it is first opened.
 
     Attributes:
-        name: ``demo``.
+        name: ``demo``, or ``demo-v1`` for the test towns of the first world.
         root: the cache folder.
         synthetic: True.
     """
 
-    name = "demo"
     synthetic = True
 
-    def __init__(self, cache: Path | None = None) -> None:
-        """Use a cache folder; None takes the user's own."""
+    def __init__(self, cache: Path | None = None, edition: int = WORLD_VERSION) -> None:
+        """Use a cache folder (None takes the user's own) and an edition of the world, 1 being the first."""
+        self.edition = edition
+        self.name = "demo-v1" if edition == 1 else "demo"
         self.root = default_cache() if cache is None else Path(cache)
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List the scenes of all towns; ``ready`` says which are rendered already."""
         return tuple(
-            dataclasses.replace(info, ready=scene_folder(info.name, self.root).is_dir()) for info in scene_infos(split)
+            dataclasses.replace(info, ready=scene_folder(info.name, self.root, self.edition).is_dir())
+            for info in scene_infos(split, self.edition)
         )
 
     def open(self, scene: str, progress: Progress | None = None) -> NuScenesScene:
@@ -40,8 +42,8 @@ class DemoSource:
         Raises:
             UserError: a scene that does not exist, or a cache folder that cannot be written to.
         """
-        folder = ensure_scene(scene, self.root, progress)
-        (info,) = (info for info in scene_infos() if info.name == scene)
+        folder = ensure_scene(scene, self.root, progress, self.edition)
+        (info,) = (info for info in scene_infos(edition=self.edition) if info.name == scene)
         written = NuScenesSource(folder).open(scene)
         if len(written) != info.frames:
             raise UserError(
@@ -57,5 +59,7 @@ class DemoSource:
         found: dict[str, str] = {}
         for info in self.scenes():
             if info.ready and len(found) < len(wanted):
-                found |= NuScenesSource(scene_folder(info.name, self.root)).scenes_of(wanted - found.keys())
+                found |= NuScenesSource(scene_folder(info.name, self.root, self.edition)).scenes_of(
+                    wanted - found.keys()
+                )
         return found

@@ -54,15 +54,26 @@ class Divider:
 
     Attributes:
         points: ``(n, 2) float64``, metres.
-        style: paint.
+        style: paint at its beginning.
         colour: ``white`` or ``yellow``.
         opposite: True where it separates opposite directions (``road_divider`` of nuScenes).
+        changes: (distance, style): where along the line, metres from its beginning, the paint changes to what.
     """
 
     points: Float
     style: LineStyle
     colour: str = "white"
     opposite: bool = False
+    changes: tuple[tuple[float, LineStyle], ...] = ()
+
+
+@dataclass(frozen=True)
+class Hatching:
+    """An area of the road that is kept free by parallel stripes: a polygon, their direction (radians), a colour."""
+
+    polygon: Polygon
+    heading: float
+    colour: str = "white"
 
 
 @dataclass(frozen=True)
@@ -86,6 +97,9 @@ class VectorMap:
         parking: parking bays (part of the road surface).
         stop_lines: polygons.
         lane_paths: centre line ``(n, 2)`` of each lane in the direction of travel; empty where not known.
+        markings: painted lines that divide no lanes: along kerbs and parking, around painted gaps.
+        hatchings: painted areas between such lines.
+        left_hand: traffic keeps to the left.
     """
 
     road_segments: tuple[Polygon, ...]
@@ -96,6 +110,9 @@ class VectorMap:
     parking: tuple[Polygon, ...] = ()
     stop_lines: tuple[Polygon, ...] = ()
     lane_paths: tuple[Float, ...] = ()
+    markings: tuple[Divider, ...] = ()
+    hatchings: tuple[Hatching, ...] = ()
+    left_hand: bool = False
 
 
 @dataclass(frozen=True)

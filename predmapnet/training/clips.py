@@ -75,7 +75,7 @@ class ImageClips:
         """Depth targets of one frame; cells of padding are unknown."""
         stored, config = self._scenes.scenes[scene], self._config
         assert stored.lidar is not None, "the cache of a network that learns depth holds lidar"
-        rig: Rig = tuple(window_camera(camera, config, 1) for camera in stored.rig)
+        rig: Rig = tuple(window_camera(camera, config) for camera in stored.rig)
         stride = LEVEL_STRIDES[0] if isinstance(config.backbone, ResNet50Config) else STRIDE
         targets = depth_targets(stored.lidar[frame].astype(np.float64), rig, stride, config.depth)
         missing = [

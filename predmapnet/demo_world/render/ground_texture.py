@@ -221,7 +221,13 @@ def _shade(sheet: _Sheet, dark: _Darkness) -> tuple[Byte, Byte]:
 
 
 def _pyramid(
-    sheet: _Sheet, world: World, light: Light, road: shapely.Geometry, dark: _Darkness, near: Float | None
+    sheet: _Sheet,
+    world: World,
+    light: Light,
+    road: shapely.Geometry,
+    dark: _Darkness,
+    quads: tuple[Float, Float],
+    near: Float | None,
 ) -> Pyramid:
     material = np.full((sheet.rows, sheet.columns), _INDEX["grass"], dtype=np.uint8)
     for surface in world.surfaces:
@@ -242,10 +248,15 @@ def _pyramid(
     fill_materials(material, local[0], local[1], sheet.texel, table, fractal, white, occlusion, shadow, base)
 
     paint = np.zeros((sheet.rows, sheet.columns, 3), dtype=np.uint8)
-    corners, attributes = paint_quads(world.map, world.seed)
-    quads = sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2)
-    attributes[:, 1] *= 1 - 0.35 * light.wetness
-    fill_paint(quads, attributes, sheet.texel, fractal_tile(0.75, seed=9), paint)
+    corners, attributes = quads
+    attributes = attributes * [1.0, 1 - 0.35 * light.wetness, 1.0]
+    fill_paint(
+        sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2),
+        attributes,
+        sheet.texel,
+        fractal_tile(0.75, seed=9),
+        paint,
+    )
 
     sizes = [(sheet.rows >> level, sheet.columns >> level) for level in range(LEVELS + 1)]
     counts = np.array([rows * columns for rows, columns in sizes])
@@ -260,12 +271,13 @@ def _pyramid(
     return Pyramid(texels, starts[:-1].astype(np.int64), rows, columns, base, paint, placement)
 
 
-def paint_ground(world: World, light: Light) -> tuple[Pyramid, Pyramid]:
+def paint_ground(world: World, light: Light, texel: float = FINE_TEXEL) -> tuple[Pyramid, Pyramid]:
     """Paint the ground of a world.
 
     Args:
         world: map, surfaces, solids (for shadows) and trajectory.
         light: decides shadows and how wet surfaces darken.
+        texel: side of the fine texture's cells, metres.
 
     Returns:
         The fine texture near the trajectory and the coarse one of everything in sight.
@@ -281,6 +293,8 @@ def paint_ground(world: World, light: Light) -> tuple[Pyramid, Pyramid]:
     near = np.column_stack([positions, np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
     road = road_of(world)
     dark = _darkness(world, light)
-    fine = _pyramid(_sheet(positions, FINE_MARGIN, FINE_TEXEL, turn, anchor), world, light, road, dark, near)
-    coarse = _pyramid(_sheet(positions, COARSE_MARGIN, COARSE_TEXEL, turn, anchor), world, light, road, dark, None)
+    paint = paint_quads(world.map, world.seed)
+    fine = _pyramid(_sheet(positions, FINE_MARGIN, texel, turn, anchor), world, light, road, dark, paint, near)
+    wide = _sheet(positions, COARSE_MARGIN, COARSE_TEXEL, turn, anchor)
+    coarse = _pyramid(wide, world, light, road, dark, paint, None)
     return fine, coarse

@@ -323,12 +323,14 @@ def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image
 
 
 @kernel
-def develop(image: Float32, exposure: float, vignette: float, noise: float, seed: int, curve: Byte, out: Byte) -> None:
+def develop(
+    image: Float32, exposures: Float32, vignette: float, noise: float, seed: int, curve: Byte, out: Byte
+) -> None:
     """Expose, add sensor noise and apply the tone curve.
 
     Args:
         image: ``(height, width, 3)`` linear radiance.
-        exposure: factor.
+        exposures: ``(3,)``, factors of red, green and blue.
         vignette: share of light that the corners lose.
         noise: standard deviation at middle grey.
         seed: of the noise.
@@ -342,11 +344,11 @@ def develop(image: Float32, exposure: float, vignette: float, noise: float, seed
         y = (row + 0.5) / height - 0.5
         for column in range(width):
             x = (column + 0.5) / width - 0.5
-            gain = exposure * (1 - vignette * 2 * (x * x + y * y))
+            gain = 1 - vignette * 2 * (x * x + y * y)
             state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
             mixed = state ^ (state >> np.uint64(29))
             for channel in range(3):
-                value = image[row, column, channel] * gain
+                value = image[row, column, channel] * gain * exposures[channel]
                 # The sum of two bytes is nearly normal, with standard deviation 0.408 of its reach.
                 low = np.float32((mixed >> np.uint64(16 * channel)) & np.uint64(255))
                 high = np.float32((mixed >> np.uint64(16 * channel + 8)) & np.uint64(255))

@@ -275,7 +275,9 @@ def build_mesh(solids: Solids, rows: NDArray[np.int64]) -> Mesh:
     normals = np.where(used, np.cross(corners - origin, after - origin), 0.0).sum(axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     plain = (materials == Material.PLAIN) & (tints[:, 0] < 0)
-    own = np.array([_MATERIALS.get(str(texture), Material.PLAIN) for texture in solids.texture], dtype=np.int64)
+    own = np.full(len(solids.texture), int(Material.PLAIN), dtype=np.int64)
+    for texture, material in _MATERIALS.items():
+        own[solids.texture == texture] = material
     materials[plain] = own[owners[plain]]
     materials[(materials == Material.FACADE) & (normals[:, 2] > 0.5)] = Material.ROOF
     colours = np.where(tints < 0, solids.colour[owners], tints)

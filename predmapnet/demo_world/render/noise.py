@@ -11,7 +11,7 @@ TILE = 1024
 """Side of a tile, texels; a power of two, so that coordinates wrap by a bit mask."""
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def fractal_tile(roughness: float, seed: int = 7) -> NDArray[np.float32]:
     """Noise with the spectrum ``1 / f ** roughness``, values spread evenly.
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapely import LineString, Polygon
 
 from mapfusion.geometry import arc_length
-from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
+from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, Hatching, LineStyle, VectorMap
 
 Float = NDArray[np.float64]
 
@@ -109,19 +109,50 @@ def _paint_divider(quads: Quads, divider: Divider, generator: np.random.Generato
     phase, wear, albedo = generator.uniform(0, 5), _wear(generator), generator.uniform(0.45, 0.78)
     aside = (DOUBLE_GAP + DOUBLE_WIDTH) / 2
     points = np.asarray(divider.points, dtype=np.float64)
-    if divider.style is LineStyle.SOLID:
-        shapes = ribbon(points, width)
-    elif divider.style is LineStyle.DASHED:
-        shapes = _dashes(points, width, 0.0, gap, phase)
-    elif divider.style is LineStyle.DOUBLE_SOLID:
-        shapes = np.concatenate([ribbon(points, DOUBLE_WIDTH, side * aside) for side in (-1, 1)])
-    elif divider.style is LineStyle.SOLID_DASHED:
-        shapes = np.concatenate(
-            [ribbon(points, DOUBLE_WIDTH, aside), _dashes(points, DOUBLE_WIDTH, -aside, gap, phase)]
-        )
-    else:
-        return
-    quads.add(shapes, wear, albedo, yellow)
+    starts = [0.0, *(distance for distance, _ in divider.changes), float(arc_length(points)[-1])]
+    styles = [divider.style, *(style for _, style in divider.changes)]
+    for style, start, stop in zip(styles, starts[:-1], starts[1:], strict=True):
+        piece = cut(points, start, stop) if divider.changes else points
+        if style is LineStyle.SOLID:
+            shapes = ribbon(piece, width)
+        elif style is LineStyle.DASHED:
+            shapes = _dashes(piece, width, 0.0, gap, phase)
+        elif style is LineStyle.DOUBLE_SOLID:
+            shapes = np.concatenate([ribbon(piece, DOUBLE_WIDTH, side * aside) for side in (-1, 1)])
+        elif style is LineStyle.SOLID_DASHED:
+            shapes = np.concatenate(
+                [ribbon(piece, DOUBLE_WIDTH, aside), _dashes(piece, DOUBLE_WIDTH, -aside, gap, phase)]
+            )
+        else:
+            continue
+        quads.add(shapes, wear, albedo, yellow)
+
+
+def _paint_hatching(quads: Quads, hatching: Hatching, generator: np.random.Generator) -> None:
+    """Parallel stripes over an area, each cut where the area's outline cuts it."""
+    stripes = stripes_over(hatching.polygon, hatching.heading, generator.uniform(0.2, 0.6), generator.uniform(1.2, 3.0))
+    yellow = float(hatching.colour == "yellow")
+    quads.add(stripes, _wear(generator), generator.uniform(0.45, 0.78), yellow)
+
+
+def stripes_over(polygon: Polygon, heading: float, width: float, period: float) -> Float:
+    """Stripes along a heading (radians) over a convex or slightly bent polygon, ``(n, 4, 2)`` metres."""
+    along = np.array([np.cos(heading), np.sin(heading)])
+    across = np.array([-along[1], along[0]])
+    ring = np.asarray(polygon.exterior.coords)
+    low, high = (ring @ along).min() - 1.0, (ring @ along).max() + 1.0
+    stripes: list[Float] = []
+    for centre in np.arange((ring @ across).min() + width / 2, (ring @ across).max(), period):
+        ends = []
+        for edge in (centre - width / 2, centre + width / 2):
+            hit = shapely.get_coordinates(
+                LineString([edge * across + low * along, edge * across + high * along]).intersection(polygon)
+            )
+            if len(hit) >= 2:
+                ends.append((hit[0], hit[1]))
+        if len(ends) == 2:
+            stripes.append(np.array([ends[0][0], ends[0][1], ends[1][1], ends[1][0]]))
+    return np.array(stripes) if stripes else np.zeros((0, 4, 2))
 
 
 def _bars(crossing: Crossing, generator: np.random.Generator) -> Float:
@@ -195,7 +226,7 @@ def paint_quads(vector_map: VectorMap, seed: int) -> tuple[Float, Float]:
     """Lay out all paint of a map.
 
     Args:
-        vector_map: dividers, crossings, stop lines and parking bays are painted.
+        vector_map: dividers, markings, hatchings, crossings, stop lines and parking bays are painted.
         seed: decides widths, gaps, age and wear of each element.
 
     Returns:
@@ -207,6 +238,10 @@ def paint_quads(vector_map: VectorMap, seed: int) -> tuple[Float, Float]:
         _paint_parking(quads, bay, generator)
     for divider in vector_map.dividers:
         _paint_divider(quads, divider, generator)
+    for marking in vector_map.markings:
+        _paint_divider(quads, marking, generator)
+    for hatching in vector_map.hatchings:
+        _paint_hatching(quads, hatching, generator)
     for crossing in vector_map.crossings:
         _paint_crossing(quads, crossing, generator)
     for polygon in vector_map.stop_lines:

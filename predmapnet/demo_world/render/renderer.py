@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.geometry import inverse_pose
-from predmapnet.demo_world.render.ground_texture import Pyramid, paint_ground
+from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, paint_ground
 from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, draw_balls, draw_faces, draw_mask
+from predmapnet.demo_world.render.response import Response
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
-from predmapnet.demo_world.street.looks import light_of
+from predmapnet.demo_world.street.looks import Light, light_of
 from predmapnet.demo_world.world import Solids, World
 from predmapnet.scenes import Camera, Rig
 
@@ -37,12 +38,18 @@ class RenderedImage:
     depth: NDArray[np.float32]
 
 
-def _tone_curve() -> NDArray[np.uint8]:
-    """From the square root of linear light to sRGB bytes, with a soft shoulder above white paper."""
-    linear = (np.arange(4096) / 4095 * 1.25) ** 2
-    shoulder = np.where(linear < 0.6, linear, 0.6 + 0.4 * (1 - np.exp(-(linear - 0.6) / 0.4)))
-    encoded = np.where(shoulder <= 0.0031308, 12.92 * shoulder, 1.055 * shoulder ** (1 / 2.4) - 0.055)
-    return np.round(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
+@dataclass(frozen=True)
+class _Moment:
+    """All that stands and moves at one key frame.
+
+    Attributes:
+        mesh: all solids.
+        darkness: corners ``(k, 8, 3)`` and counts ``(k,)`` of outlines on the ground that what moves darkens, and the
+            light that is left there, [0, 255].
+    """
+
+    mesh: Mesh
+    darkness: tuple[tuple[Float, NDArray[np.int64], int], ...]
 
 
 def _lamp_field(world: World) -> tuple[NDArray[np.float32], Float]:
@@ -70,17 +77,28 @@ class Renderer:
     Args:
         world: what to draw.
         supersampling: samples per pixel and direction along the edges of solids, 1 to 4.
+        response: how the cameras turn light into bytes; None takes well-exposed ones.
+        light: of the scene; None takes that of the world's look.
+        texel: side of the finest ground texture's cells, metres.
         threads: cameras that :meth:`render_frame` draws at once. One for callers that run several processes.
     """
 
-    def __init__(self, world: World, supersampling: int = 2, threads: int = 1) -> None:
+    def __init__(
+        self,
+        world: World,
+        supersampling: int = 2,
+        threads: int = 1,
+        response: Response | None = None,
+        light: Light | None = None,
+        texel: float = FINE_TEXEL,
+    ) -> None:
         if not 1 <= supersampling <= 4:
             raise ValueError(f"supersampling must be 1 to 4, not {supersampling}")
         self.world = world
         self.supersampling = supersampling
         self.threads = threads
-        self.light = light_of(world.look, world.seed)
-        self._ground = paint_ground(world, self.light)
+        self.light = light_of(world.look, world.seed) if light is None else light
+        self._ground = paint_ground(world, self.light, texel)
         solids = world.solids
         self._moving = solids.velocity.any(axis=1) | ~solids.always
         self._standing_mesh = build_mesh(solids, np.flatnonzero(~self._moving))
@@ -88,7 +106,8 @@ class Renderer:
         if self.light.sun.any():
             self._sunlit[:] = self._shadow_at(self._ground[0], solids.centre[:, :2], solids)
         self._lamps, self._lamps_origin = _lamp_field(world)
-        self._curve = _tone_curve()
+        self._response = Response() if response is None else response
+        self._curve = self._response.tone_curve()
 
     @staticmethod
     def _shadow_at(ground: Pyramid, points: Float, solids: Solids) -> NDArray[np.float32]:
@@ -135,15 +154,16 @@ class Renderer:
         moving = present[self._moving[present]]
         return join(self._standing_mesh, build_mesh(placed, moving)), placed, moving
 
-    def _dynamic_mask(self, view: View, placed: Solids, moving: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Ground darkened by what moves, ``(height, width)``, 255 where nothing does."""
-        mask = np.full((view.height, view.width), 255, dtype=np.uint8)
+    def _moment(self, frame_index: int) -> _Moment:
+        """Return what all cameras share at a key frame."""
+        mesh, placed, moving = self.mesh_at(frame_index)
         chosen = np.zeros(len(placed.shape), dtype=bool)
         chosen[moving] = True
         layers: list[tuple[list[Float], int]] = []
         if self.light.sun.any():
             layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction)], 90))
         layers.append(([polygon for polygon, _ in contact_polygons(placed, chosen)], 30))
+        darkness = []
         for polygons, value in layers:
             corners = np.zeros((len(polygons), MOST_CORNERS, 3))
             counts = np.zeros(len(polygons), dtype=np.int64)
@@ -154,8 +174,17 @@ class Renderer:
                 ]
                 corners[row, : len(kept), :2] = kept
                 counts[row] = len(kept)
+            darkness.append((corners, counts, value))
+        return _Moment(mesh, tuple(darkness))
+
+    @staticmethod
+    def _dynamic_mask(view: View, moment: _Moment) -> NDArray[np.uint8]:
+        """Ground darkened by what moves, ``(height, width)``, 255 where nothing does."""
+        mask = np.full((view.height, view.width), 255, dtype=np.uint8)
+        for corners, counts, value in moment.darkness:
             draw_mask(corners, counts, view, value, np.empty((18, 3)), mask)
-        return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if len(moving) else mask
+        moves = any(len(counts) for _, counts, _ in moment.darkness)
+        return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if moves else mask
 
     def view(self, camera: Camera, frame_index: int) -> View:
         """Return a camera at a key frame as plain numbers."""
@@ -192,7 +221,10 @@ class Renderer:
         Returns:
             The image and its depth; the same bytes for the same world, camera and frame.
         """
-        mesh, placed, moving = self.mesh_at(frame_index)
+        return self._draw(camera, frame_index, self._moment(frame_index))
+
+    def _draw(self, camera: Camera, frame_index: int, moment: _Moment) -> RenderedImage:
+        mesh = moment.mesh
         view, samples = self.view(camera, frame_index), self.supersampling
         nearness, ids = self.rasterise(mesh, view, samples)
         around = Surroundings(
@@ -203,25 +235,35 @@ class Renderer:
         size = (camera.height, camera.width)
         image = np.empty((*size, 3), dtype=np.float32)
         depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
-        dynamic = self._dynamic_mask(view, placed, moving)
+        dynamic = self._dynamic_mask(view, moment)
         found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
         shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, found, scratch, image, depth, ground_share)
         if self.light.wetness > 0:
             mirror_in_wet(around, view, ground_share, image)
-        image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0.5 * camera.width / 800), dtype=np.float32)
-        name = zlib.crc32(camera.name.encode())
+        return RenderedImage(self._develop(image, camera, frame_index), depth)
+
+    def _develop(self, image: NDArray[np.float32], camera: Camera, frame_index: int) -> NDArray[np.uint8]:
+        """Turn linear light into the bytes that the camera stores."""
+        response, name = self._response, zlib.crc32(camera.name.encode())
+        deviation = response.blur * camera.width / 800
+        if deviation > 0.15:
+            image = np.asarray(cv2.GaussianBlur(image, (3, 3) if deviation < 0.8 else (5, 5), deviation), np.float32)
         generator = np.random.default_rng([self.world.seed, name])
-        exposure = self.light.exposure * float(np.exp(generator.normal(0, 0.06)))
+        exposures = response.exposures(len(self.world.trajectory.timestamps), generator)
+        gains = (self.light.exposure * exposures[frame_index] * np.array(response.balance)).astype(np.float32)
         vignette = float(generator.uniform(0.12, 0.32))
+        # Scaling a photograph down averages its noise, though neighbouring pixels share some of it.
+        noise = response.noise * self.light.noise / 0.18**0.5 / 0.42 * min(1.0, camera.width / 800) ** 0.5
         seed = int(np.random.default_rng([self.world.seed, name, frame_index]).integers(2**31))
-        out = np.empty((*size, 3), dtype=np.uint8)
-        develop(image, exposure, vignette, self.light.noise / 0.18**0.5 / 0.42, seed, self._curve, out)
-        return RenderedImage(out, depth)
+        out = np.empty(image.shape, dtype=np.uint8)
+        develop(image, gains, vignette, noise, seed, self._curve, out)
+        return out
 
     def render_frame(self, rig: Rig, frame_index: int) -> dict[str, RenderedImage]:
         """Draw all cameras of a rig at a key frame, ``threads`` at a time; by camera name."""
+        moment = self._moment(frame_index)
         if self.threads == 1:
-            return {camera.name: self.render(camera, frame_index) for camera in rig}
+            return {camera.name: self._draw(camera, frame_index, moment) for camera in rig}
         with ThreadPoolExecutor(self.threads) as pool:
-            images = pool.map(lambda camera: self.render(camera, frame_index), rig)
+            images = pool.map(lambda camera: self._draw(camera, frame_index, moment), rig)
             return {camera.name: image for camera, image in zip(rig, images, strict=True)}

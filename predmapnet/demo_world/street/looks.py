@@ -87,3 +87,36 @@ def light_of(look: Look, seed: int) -> Light:
         direction, _rgb(0.0, 0.0, 0.0), _rgb(0.012, 0.013, 0.020), _rgb(0.006, 0.008, 0.016), _rgb(0.035, 0.030, 0.030),
         _rgb(0.02, 0.018, 0.018), cover, hazy, 1.5 * exposure, 0.040, 0.25 * float(share > 0.6), 1.0, 0.3, 1.0,
     )  # fmt: skip
+
+
+def harder_light(light: Light, seed: int) -> Light:
+    """Return the light of a training scene: often haze or fog, a low sun, or a sun half behind clouds.
+
+    Args:
+        light: of :func:`light_of`.
+        seed: of the scene.
+    """
+    generator = np.random.default_rng([seed, 103])
+    kind, strength = generator.uniform(size=2)
+    if kind < 0.12:
+        # Visibility is about 3 / haze: from 60 m to 500 m.
+        haze = float(0.006 * (0.05 / 0.006) ** strength)
+        clear = float(np.exp(-20 * haze))
+        grey = light.horizon.mean() + 0.3 * (light.horizon - light.horizon.mean())
+        fog = np.asarray(grey * generator.uniform(0.75, 1.0), dtype=np.float32)
+        ambient = light.ambient + 0.25 * (1 - clear) * light.sun
+        return light._replace(
+            haze=haze, sun=light.sun * np.float32(clear**2), ambient=ambient, horizon=fog,
+            zenith=light.zenith + (fog - light.zenith) * np.float32(0.8), cloud=fog, cloud_cover=1.0,
+        )  # fmt: skip
+    light = light._replace(haze=light.haze * float(np.exp(generator.normal(0.3, 0.7))))
+    if not light.sun.any():
+        return light
+    if kind < 0.40:
+        elevation = np.radians(generator.uniform(4.0, 18.0))
+        level = light.sun_direction[:2] / np.linalg.norm(light.sun_direction[:2])
+        direction = np.array([*(level * np.cos(elevation)), np.sin(elevation)], dtype=np.float32)
+        return light._replace(sun_direction=direction, ambient=light.ambient * np.float32(generator.uniform(0.6, 1.0)))
+    # Clouds before the sun soften the contrast of shadows; a clear sky hardens it.
+    veil = np.float32(generator.uniform(0.35, 1.25))
+    return light._replace(sun=light.sun * veil, ambient=light.ambient * np.float32(np.sqrt(1.4 / (0.4 + veil))))

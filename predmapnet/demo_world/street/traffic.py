@@ -148,6 +148,7 @@ def drive(solids: SolidList, vector_map: VectorMap, road: shapely.Geometry, traj
         lateral = float(generator.choice([-3.5, 3.5, -3.5]))
         plans.append((lateral, 1.0, ego_station + generator.uniform(-30, 45) + generator.uniform(-2, 2) * times))
     taken: list[list[Polygon]] = [[] for _ in times]
+    keep_side = -1.0 if vector_map.left_hand else 1.0
     for lateral, sense, stations in plans:
         size, colour = vehicle_size(generator, heavy=0.15), lacquer(generator)
         for frame, station in enumerate(stations):
@@ -155,7 +156,7 @@ def drive(solids: SolidList, vector_map: VectorMap, road: shapely.Geometry, traj
                 continue
             two = shapely.get_coordinates([line.interpolate(station - 1.5), line.interpolate(station + 1.5)])
             direction = (two[1] - two[0]) / max(float(np.linalg.norm(two[1] - two[0])), 1e-6)
-            centre = two.mean(axis=0) + lateral * np.array([-direction[1], direction[0]])
+            centre = two.mean(axis=0) + keep_side * lateral * np.array([-direction[1], direction[0]])
             yaw = float(np.arctan2(direction[1], direction[0])) + (np.pi if sense < 0 else 0.0)
             outline = footprint(centre, yaw, size)
             ego = footprint(

@@ -1,55 +1,49 @@
-"""A drive through a town: lane by lane along the roads, turning at junctions, at speeds that a person would drive."""
+"""A drive through a town: lane by lane along the streets, turning at junctions, at speeds that a person would drive."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import shapely
 from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from mapfusion.geometry import arc_length
-from predmapnet.demo_world.town.junctions import Arm, has_splitter
+from predmapnet.demo_world.town.driving import (
+    FRONT_OVERHANG,
+    PATH_STEP,
+    drive_along_path,
+    evenly,
+    sharpest_bend,
+    turn_between,
+)
+from predmapnet.demo_world.town.lane_graph import Carriageway
+from predmapnet.demo_world.town.mirror import mirrored
 from predmapnet.demo_world.town.town import Town
 from predmapnet.demo_world.world import Trajectory
 
 Float = NDArray[np.float64]
 
-KEY_FRAMES = 40
-FRAME_SECONDS = 0.5
-FIRST_TIMESTAMP = 1_532_402_927_000_000_000
-"""Nanoseconds; in the summer in which nuScenes was recorded, a whole number of microseconds."""
+SHORTEST_DRIVE = 60.0
+"""Metres that the car covers in every scene."""
 
-MARGIN = 48.0
-"""No key frame lies closer than this to the open end of a road, metres."""
+LONG_ENOUGH = 260.0
+"""Metres of path that are enough for a drive."""
 
-SHARPEST_BEND = 0.17
+MARGIN = 50.0
+"""No key frame lies closer than this to where a street leaves the town, metres."""
+
+SHARPEST_BEND = 0.2
 """Curvature that a drive may have, per metre."""
 
-PATH_STEP = 0.25
-LATERAL_LIMIT = 2.3
-ACCELERATION_LIMIT = 1.6
-BRAKING_LIMIT = 2.2
-"""Metres per second squared."""
-
-KERB_TO_AXLE = 1.9
-"""Between the kerb and the middle of the rear axle in a right turn, metres."""
-
-SPLITTER_SWERVE = 0.6
-"""How far cars keep to the right of their lane at a splitter island, metres."""
-
-FRONT_OVERHANG = 4.0
-"""From the rear axle to the front bumper, metres."""
+HALF_CAR = 0.85
+"""Half of the width between the wheels, metres."""
 
 
-@dataclass(frozen=True)
-class Leg:
-    """One stretch of road, driven in one direction: +1 along its stations, -1 against them."""
-
-    edge: int
-    direction: int
+class NoDriveError(Exception):
+    """A town without a drive: its plan is too cramped for a car to get anywhere."""
 
 
 def drive(town: Town, seed: int) -> Trajectory:
@@ -61,155 +55,142 @@ def drive(town: Town, seed: int) -> Trajectory:
 
     Returns:
         40 key frames, 0.5 s apart, with a small pitch and roll.
+
+    Raises:
+        NoDriveError: no street is long enough, or traffic stops the car too early.
     """
     random = np.random.default_rng([0x726F757465, seed])
     path, stops = _draw_path(random, town)
-    cruise = float(random.uniform(8.0, 12.0))
-    stations = _drive_along(random, path, stops, cruise)
-    travelled = arc_length(path)
-    positions = np.stack([np.interp(stations, travelled, path[:, axis]) for axis in range(2)], axis=1)
-    headings = np.interp(stations, travelled, _headings(path))
-    pitch, roll = np.radians(random.normal(0.0, 0.1, (2, KEY_FRAMES)))
-    poses = np.tile(np.eye(4), (KEY_FRAMES, 1, 1))
-    poses[:, :3, :3] = _rotations(headings, pitch, roll)
-    poses[:, :2, 3] = positions
-    step = int(FRAME_SECONDS * 1e9)
-    return Trajectory(FIRST_TIMESTAMP + seed * 3600 * 10**9 + step * np.arange(KEY_FRAMES, dtype=np.int64), poses)
-
-
-def _rotations(yaw: Float, pitch: Float, roll: Float) -> Float:
-    """Rotation matrices ``(n, 3, 3)`` of yaw about z, then pitch about y, then roll about x."""
-
-    def about(axis: int, angle: Float) -> Float:
-        first, second = [(1, 2), (2, 0), (0, 1)][axis]
-        matrices = np.tile(np.eye(3), (len(angle), 1, 1))
-        matrices[:, first, first] = matrices[:, second, second] = np.cos(angle)
-        matrices[:, second, first] = np.sin(angle)
-        matrices[:, first, second] = -np.sin(angle)
-        return matrices
-
-    return about(2, yaw) @ about(1, pitch) @ about(0, roll)
+    if town.vector_map.left_hand:
+        path = mirrored(path)
+    driven = drive_along_path(random, path, stops, float(random.uniform(7.0, 12.0)), seed)
+    if arc_length(driven.ego_to_global[:, :2, 3])[-1] <= SHORTEST_DRIVE:
+        raise NoDriveError("the drive is too short")
+    return driven
 
 
 def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
-    """Draw a walk through the town that is long enough, and the path of the rear axle along it.
+    """Draw a walk through the town that is long enough and stays on the road, and the path of the rear axle.
 
     Returns:
         The path ``(n, 2)`` at even steps, and the distances along it at which a car may have to stop.
+
+    Raises:
+        NoDriveError: the town has no such walk.
     """
+    road = town.surface.buffer(0.05)
+    shapely.prepare(road)
     best: tuple[Float, Float] | None = None
-    for _ in range(60):
-        legs = _draw_legs(random, town)
-        if len(legs) < 3:
+    for _ in range(250):
+        ways = _draw_ways(random, town.carriageways)
+        if len(ways) < 3:
             continue
-        path, stops = _trace(random, town, legs)
+        path, stops = _trace(random, ways)
+        if len(path) < 40 or sharpest_bend(path) > SHARPEST_BEND or not _on_road(path, road):
+            continue
+        if len(path) * PATH_STEP > LONG_ENOUGH:
+            return path, stops
         if best is None or len(path) > len(best[0]):
             best = path, stops
-        if len(path) * PATH_STEP > 20.0 * 12.0 + 20.0 and _sharpest(path) < SHARPEST_BEND:
-            return path, stops
     if best is None:
-        raise RuntimeError("the town has no road that is long enough for a drive")
+        raise NoDriveError("the town has no street that is long enough for a drive")
     return best
 
 
-def _draw_legs(random: Generator, town: Town) -> list[Leg]:
+def _on_road(path: Float, road: shapely.Geometry) -> bool:
+    """Whether both rear wheels stay on the road all the way."""
+    tangents = np.gradient(path, axis=0)
+    normals = np.stack([-tangents[:, 1], tangents[:, 0]], axis=1) / np.linalg.norm(tangents, axis=1, keepdims=True)
+    wheels = np.concatenate([path + HALF_CAR * normals, path - HALF_CAR * normals])[::3]
+    return bool(shapely.contains_xy(road, wheels).all())
+
+
+def _draw_ways(random: Generator, ways: tuple[Carriageway, ...]) -> list[Carriageway]:
     """Start anywhere, turn at random at each junction, never turn back, never leave the town."""
-    edges = town.plan.edges
-    start = int(random.integers(len(edges)))
-    direction = int(random.choice([-1, 1]))
-    if edges[start].nodes[1 if direction == 1 else 0] < 0:
-        direction = -direction
-    legs = [Leg(start, direction)]
-    length = edges[start].end - edges[start].start
-    visited = {start}
-    while length < 460.0:
-        node = edges[legs[-1].edge].nodes[1 if legs[-1].direction == 1 else 0]
-        if node < 0:
-            break
-        options = [Leg(edge, side) for edge, side in town.plan.arms(node) if edge not in visited]
-        options = [leg for leg in options if not edges[leg.edge].leaves_town] or options
+    current = ways[int(random.integers(len(ways)))]
+    chosen = [current]
+    visited = {id(current)}
+    length = _length(current)
+    while length < LONG_ENOUGH + 100.0 and current.nodes[1] >= 0:
+        options = [
+            way
+            for way in ways
+            if way.nodes[0] == current.nodes[1] and id(way) not in visited and abs(_turn_angle(current, way)) < 2.5
+        ]
+        options = [way for way in options if way.nodes[1] >= 0 and way.main] or options
         if not options:
             break
         # Turning is drawn more often than going on, because junctions are where maps are difficult.
-        same_road = np.array([edges[leg.edge].road == edges[legs[-1].edge].road for leg in options])
-        weights = np.where(same_road, 1.0, 1.2)
-        legs.append(options[int(random.choice(len(options), p=weights / weights.sum()))])
-        visited.add(legs[-1].edge)
-        length += edges[legs[-1].edge].end - edges[legs[-1].edge].start
-    return legs
+        weights = np.array([0.8 if abs(_turn_angle(current, way)) < 0.5 else 1.0 for way in options])
+        current = options[int(random.choice(len(options), p=weights / weights.sum()))]
+        chosen.append(current)
+        visited.add(id(current))
+        length += _length(current)
+    return chosen
 
 
-def _turn_angle(town: Town, leg: Leg, following: Leg) -> float:
-    """Change of heading from one leg to the next, radians, positive to the left."""
-    headings = []
-    for current, at_end in ((leg, True), (following, False)):
-        edge = town.plan.edges[current.edge]
-        station = edge.end if (current.direction == 1) == at_end else edge.start
-        tangent = town.plan.roads[edge.road].direction(np.array([station]))[0] * current.direction
-        headings.append(np.arctan2(tangent[1], tangent[0]))
-    return float(np.angle(np.exp(1j * (headings[1] - headings[0]))))
+def _length(way: Carriageway) -> float:
+    return float(arc_length(way.lines[0])[-1])
 
 
-def _lane_for(town: Town, leg: Leg, node: int, turn: float | None, usual: int) -> int:
-    """The lane to be in at a node: the outermost for a right turn or a roundabout, the innermost for a left turn."""
-    lanes = town.plan.roads[town.plan.edges[leg.edge].road].section.lanes
-    if node >= 0 and town.plan.nodes[node].is_roundabout:
-        return lanes - 1
-    if turn is None or abs(turn) < np.radians(35.0):
-        return min(usual, lanes - 1)
-    return 0 if turn > 0 else lanes - 1
+def _turn_angle(before: Carriageway, after: Carriageway) -> float:
+    """Change of heading from one carriageway to the next, radians, positive to the left."""
+    first, last = before.lines[0][-1] - before.lines[0][-2], after.lines[0][1] - after.lines[0][0]
+    return float(np.angle(complex(*last) / complex(*first)))
 
 
-def _trace(random: Generator, town: Town, legs: list[Leg]) -> tuple[Float, Float]:
-    """Join the lanes of the legs into one smooth path."""
-    turns = [_turn_angle(town, leg, following) for leg, following in pairwise(legs)]
-    usual = int(random.integers(3))
+def _lane(random: Generator, is_open: NDArray[np.bool_], angle: float | None) -> int:
+    """An open lane that suits a turn; any for going straight on."""
+    lanes = np.flatnonzero(is_open)
+    if angle is None or abs(angle) < 0.6:
+        return int(lanes[random.integers(len(lanes))])
+    return int(lanes[0] if angle > 0 else lanes[-1])
+
+
+def _trace(random: Generator, ways: list[Carriageway]) -> tuple[Float, Float]:
+    """Join the lanes of the carriageways into one smooth path."""
+    angles = [_turn_angle(before, after) for before, after in pairwise(ways)]
     pieces: list[Float] = []
     stop_points: list[Float] = []
-    for index, leg in enumerate(legs):
-        first, last = _ends(town, leg)
-        lane_in = _lane_for(town, leg, first.node, turns[index - 1] if index else None, usual)
-        lane_out = _lane_for(town, leg, last.node, turns[index] if index < len(turns) else None, usual)
-        lane_line = _lane_line(town, leg, first, last, lane_in, lane_out)
-        if index == 0:
-            lane_line = _trimmed(lane_line, MARGIN if first.node < 0 else float(random.uniform(0.0, 25.0)), 0.0)
-        if index == len(legs) - 1 and last.node < 0:
-            lane_line = _trimmed(lane_line, 0.0, MARGIN)
-        if len(lane_line) < 2:
+    straight_lane: int | None = None
+    for index, way in enumerate(ways):
+        arriving = angles[index - 1] if index else None
+        leaving = angles[index] if index < len(angles) else None
+        lane_in = _lane(random, way.open_at_start, arriving)
+        if straight_lane is not None and straight_lane < len(way.open_at_start) and way.open_at_start[straight_lane]:
+            lane_in = straight_lane
+        lane_out = _lane(random, way.open_at_end, leaving)
+        if (leaving is None or abs(leaving) < 0.6) and way.open_at_end[lane_in]:
+            lane_out = lane_in
+        straight_lane = lane_out if leaving is not None and abs(leaving) < 0.6 else None
+        line = _lane_line(way, lane_in, lane_out)
+        front = MARGIN if way.nodes[0] < 0 else (float(random.uniform(0.0, 25.0)) if index == 0 else 0.0)
+        line = _trimmed(line, front, MARGIN if way.nodes[1] < 0 else (3.0 if index == len(ways) - 1 else 0.0))
+        if len(line) < 2:
             continue
         if pieces:
-            pieces.append(_through_junction(town, first.node, pieces[-1], lane_line))
-        pieces.append(lane_line)
-        if last.node >= 0 and not town.plan.nodes[last.node].is_roundabout:
-            stop_points.append(_stop_point(lane_line, last))
+            pieces.append(_through_junction(pieces[-1], line, arriving or 0.0))
+        pieces.append(line)
+        if np.isfinite(way.stop):
+            travelled = arc_length(line)
+            at = max(travelled[-1] - way.stop - FRONT_OVERHANG, 0.0)
+            stop_points.append(np.array([np.interp(at, travelled, line[:, axis]) for axis in range(2)]))
+    if not pieces:
+        return np.zeros((0, 2)), np.zeros(0)
     path = np.concatenate(pieces)
     keep = np.concatenate([[True], np.linalg.norm(np.diff(path, axis=0), axis=1) > 1e-6])
-    path = _evenly(path[keep])
-    path = _evenly(gaussian_filter1d(path, 1.2 / PATH_STEP, axis=0, mode="nearest"))
+    path = evenly(path[keep])
+    path = evenly(gaussian_filter1d(path, 1.2 / PATH_STEP, axis=0, mode="nearest"))
     stops = [int(np.argmin(np.linalg.norm(path - point, axis=1))) * PATH_STEP for point in stop_points]
     return path, np.array(stops)
 
 
-def _ends(town: Town, leg: Leg) -> tuple[Arm, Arm]:
-    first, last = town.arms[leg.edge]
-    return (first, last) if leg.direction == 1 else (last, first)
-
-
-def _lane_line(town: Town, leg: Leg, first: Arm, last: Arm, lane_in: int, lane_out: int) -> Float:
-    """The centre of the lane between two junctions, with a gentle change of lane where one is needed."""
-    edge = town.plan.edges[leg.edge]
-    road = town.plan.roads[edge.road]
-    begin, finish = (edge.start, edge.end) if leg.direction == 1 else (edge.end, edge.start)
-    begin, finish = begin + leg.direction * first.clear, finish - leg.direction * last.clear
-    stations = np.linspace(begin, finish, max(2, int(abs(finish - begin)) + 1))
-    share = np.clip((np.linspace(0.0, 1.0, len(stations)) - 0.1) / 0.75, 0.0, 1.0)
-    blend = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    swerves = [SPLITTER_SWERVE if has_splitter(town.plan, road, arm.node) else 0.0 for arm in (first, last)]
-    start_offset, end_offset = (
-        road.section.lane_centre(lane) + swerve for lane, swerve in zip((lane_in, lane_out), swerves, strict=True)
-    )
-    offsets = (1.0 - blend) * start_offset + blend * end_offset
-    return road.locate(stations, -leg.direction * offsets)
+def _lane_line(way: Carriageway, lane_in: int, lane_out: int) -> Float:
+    """The centre of a lane, with a gentle change to another one where that is needed."""
+    share = np.clip((np.linspace(0.0, 1.0, way.lines.shape[1]) - 0.1) / 0.75, 0.0, 1.0)
+    blend = (share**3 * (10.0 - 15.0 * share + 6.0 * share**2))[:, None]
+    line: Float = (1.0 - blend) * way.lines[lane_in] + blend * way.lines[lane_out]
+    return line
 
 
 def _trimmed(line: Float, front: float, back: float) -> Float:
@@ -218,108 +199,7 @@ def _trimmed(line: Float, front: float, back: float) -> Float:
     return kept
 
 
-def _stop_point(lane_line: Float, arm: Arm) -> Float:
-    """Where the rear axle stands when the car waits at the stop line."""
-    back = arm.stop - arm.clear + 0.6 + FRONT_OVERHANG
-    travelled = arc_length(lane_line)
-    at = max(travelled[-1] - back, 0.0)
-    return np.array([np.interp(at, travelled, lane_line[:, axis]) for axis in range(2)])
-
-
-def _through_junction(town: Town, node_index: int, before: Float, after: Float) -> Float:
-    """Join the end of one lane to the start of the next: one arc, or the ring of a roundabout."""
-    node = town.plan.nodes[node_index]
-    start, end = before[-1], after[0]
-    start_direction, end_direction = before[-1] - before[-2], after[1] - after[0]
-    if not node.is_roundabout:
-        return _turn(start, start_direction, end, end_direction, town.corner_radius + KERB_TO_AXLE)
-    radius = (node.island_radius + node.outer_radius) / 2
-    enter, leave = (np.arctan2(*(point - node.position)[::-1]) for point in (start, end))
-    # Traffic circles anticlockwise; it joins the ring some way behind the arm and leaves it some way before.
-    sweep = (leave - enter) % (2 * np.pi)
-    margin = min(np.radians(38.0), 0.42 * sweep)
-    angles = np.linspace(enter + margin, enter + sweep - margin, max(2, int(np.degrees(sweep - 2 * margin) / 4)))
-    spokes = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    ring = node.position + radius * spokes
-    along = np.stack([-spokes[:, 1], spokes[:, 0]], axis=1)
-    first, last = (vector / np.linalg.norm(vector) for vector in (start_direction, end_direction))
-    return np.concatenate([_arc(start, first, ring[0], along[0]), ring, _arc(ring[-1], along[-1], end, last)])
-
-
-def _turn(start: Float, start_direction: Float, end: Float, end_direction: Float, right_radius: float) -> Float:
-    """A turn between two lanes: straight on, an arc, straight on. To the right it follows the rounded kerb."""
-    first, last = (vector / np.linalg.norm(vector) for vector in (start_direction, end_direction))
-    angle = float(np.arctan2(first[0] * last[1] - first[1] * last[0], first @ last))
-    if abs(angle) < np.radians(15.0):
-        return _arc(start, first, end, last)
-    # Where the two lanes would meet: start + before * first = end - after * last.
-    before, after = np.linalg.solve(np.stack([first, last], axis=1), end - start)
-    if min(before, after) < 1.0:
-        return _arc(start, first, end, last)
-    reach = min(before, after, right_radius * np.tan(-angle / 2) if angle < 0 else np.inf)
-    enter, leave = start + (before - reach) * first, end - (after - reach) * last
-    return np.concatenate([start[None], enter[None], _arc(enter, first, leave, last), leave[None], end[None]])
-
-
-def _arc(start: Float, first: Float, end: Float, last: Float) -> Float:
-    """A cubic Bezier curve between two places and directions (unit length), near a circular arc where one fits."""
-    angle = max(float(np.arccos(np.clip(first @ last, -1.0, 1.0))), 1e-3)
-    handle = 4 / 3 * np.tan(angle / 4) / (2 * np.sin(angle / 2)) * np.linalg.norm(end - start)
-    t = np.linspace(0.0, 1.0, 40)[:, None]
-    controls = (start, start + handle * first, end - handle * last, end)
-    weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3)
-    curve: Float = np.sum([weight * control for weight, control in zip(weights, controls, strict=True)], axis=0)
-    return curve
-
-
-def _evenly(path: Float) -> Float:
-    travelled = arc_length(path)
-    stations = np.arange(0.0, travelled[-1], PATH_STEP)
-    return np.stack([np.interp(stations, travelled, path[:, axis]) for axis in range(2)], axis=1)
-
-
-def _headings(path: Float) -> Float:
-    tangents = np.gradient(path, axis=0)
-    return np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
-
-
-def _curvature(path: Float) -> Float:
-    bend: Float = gaussian_filter1d(np.gradient(_headings(path)), 2.0)
-    return np.abs(bend) / PATH_STEP
-
-
-def _sharpest(path: Float) -> float:
-    return float(_curvature(path).max())
-
-
-def _drive_along(random: Generator, path: Float, stops: Float, cruise: float) -> Float:
-    """Distances along the path ``(KEY_FRAMES,)`` at the key frames."""
-    limit = np.minimum(cruise, np.sqrt(LATERAL_LIMIT / np.maximum(_curvature(path), 1e-6)))
-    waits = np.zeros(len(path))
-    for stop in stops:
-        index = round(stop / PATH_STEP)
-        if stop > 25.0 and waits.sum() == 0.0 and random.random() < 0.3:
-            limit[index] = 0.0
-            waits[index] = random.uniform(0.8, 2.5)
-    speed = _reachable(limit)
-    seconds = 2 * PATH_STEP / np.maximum(speed[:-1] + speed[1:], 1e-3)
-    clock = np.concatenate([[0.0], np.cumsum(seconds)])
-    held = np.flatnonzero(waits)
-    times, stations = clock + np.concatenate([[0.0], np.cumsum(waits)[:-1]]), PATH_STEP * np.arange(len(path))
-    for index in held:
-        # Standing still: the same place at two times.
-        times = np.insert(times, index + 1, times[index] + waits[index])
-        stations = np.insert(stations, index + 1, stations[index])
-    reached: Float = np.interp(FRAME_SECONDS * np.arange(KEY_FRAMES), times, stations)
-    return reached
-
-
-def _reachable(limit: Float) -> Float:
-    """The fastest speeds below a limit that acceleration and braking allow."""
-    squared = limit**2
-    for index in range(1, len(squared)):
-        squared[index] = min(squared[index], squared[index - 1] + 2 * ACCELERATION_LIMIT * PATH_STEP)
-    for index in range(len(squared) - 2, -1, -1):
-        squared[index] = min(squared[index], squared[index + 1] + 2 * BRAKING_LIMIT * PATH_STEP)
-    speed: Float = np.sqrt(squared)
-    return speed
+def _through_junction(before: Float, after: Float, angle: float) -> Float:
+    """Join the end of one lane to the start of the next."""
+    radius = 6.2 if angle < 0 else np.inf
+    return turn_between(before[-1], before[-1] - before[-2], after[0], after[1] - after[0], radius)

@@ -1,14 +1,22 @@
-"""Changes to a frame that keep its truth exact: mirroring left and right, light, noise, missing cameras."""
+"""Changes to a frame that keep its truth exact: mirroring left and right, photography, missing cameras."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.photography import (
+    PhotographySettings,
+    add_noise,
+    add_stray_light,
+    blur,
+    save_and_load,
+    tone_tables,
+)
 from predmapnet.training.data.scene_cache import Images
 
 Float = NDArray[np.float64]
@@ -23,18 +31,12 @@ class AugmentationSettings:
 
     Attributes:
         mirror: probability of swapping left and right.
-        gain: largest change of the exposure, as a logarithm.
-        colour: largest change of one colour channel, as a logarithm.
-        offset: largest shift of the black level, of 255.
-        noise: largest standard deviation of the pixel noise, of 255.
+        photography: light, lenses, sensors and files.
         camera_dropout: probability that one camera of a frame is missing; a single one never is.
     """
 
     mirror: float = 0.5
-    gain: float = 0.25
-    colour: float = 0.08
-    offset: float = 10.0
-    noise: float = 5.0
+    photography: PhotographySettings = field(default_factory=PhotographySettings)
     camera_dropout: float = 0.05
 
 
@@ -59,29 +61,22 @@ def mirror_pose(ego_to_global: Float) -> Float:
 
 
 def change_light(images: Images, settings: AugmentationSettings, generator: np.random.Generator) -> Images:
-    """Change exposure, colour, black level and noise of one frame, a little differently in each camera.
+    """Take the photographs of one frame again, in other light and with other lenses, sensors and files.
 
     Args:
         images: ``(N, h, w, 3)``.
-        settings: how strongly.
+        settings: how strongly they change.
         generator: source of randomness.
+
+    Returns:
+        New images of the same shape.
     """
-    cameras = len(images)
-    common = generator.uniform(-1, 1, (1, 3)) * settings.colour + generator.uniform(-1, 1) * settings.gain
-    own = 0.2 * settings.gain * generator.uniform(-1, 1, (cameras, 1))
-    scale = np.exp(common + own)
-    offset = generator.uniform(-1, 1) * settings.offset
-    levels = np.arange(256)[None, :, None] * scale[:, None, :] + offset
-    table = np.clip(np.round(levels), 0, 255).astype(np.uint8)
-    changed = np.stack([cv2.LUT(image, table[index][None]) for index, image in enumerate(images)])
-    deviation = generator.uniform(0, settings.noise)
-    # One draw serves all cameras, each at its own offset: independent noise costs more than the eye can tell.
-    grain = np.round(generator.standard_normal(images[0].size, dtype=np.float32) * deviation).astype(np.int16)
-    shifts = generator.integers(0, grain.size, cameras)
-    for index in range(cameras):
-        noisy = cv2.add(changed[index].astype(np.int16), np.roll(grain, shifts[index]).reshape(images[0].shape))
-        changed[index] = np.clip(noisy, 0, 255).astype(np.uint8)
-    return changed
+    look = settings.photography
+    changed = np.stack([add_stray_light(image, look, generator) for image in images])
+    changed = blur(changed, look, generator)
+    tables = tone_tables(len(images), look, generator)
+    changed = np.stack([cv2.LUT(image, tables[index][None]) for index, image in enumerate(changed)])
+    return save_and_load(add_noise(changed, look, generator), look, generator)
 
 
 def drop_camera(cameras: int, settings: AugmentationSettings, generator: np.random.Generator) -> NDArray[np.bool_]:

@@ -1,9 +1,12 @@
+from hashlib import md5
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from predmapnet.demo_world import catalogue
+from predmapnet.demo_world.first_towns import first_town
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 from predmapnet.demo_world.world import Look
 from predmapnet.errors import UserError
@@ -11,14 +14,14 @@ from predmapnet.errors import UserError
 
 def test_splits_share_no_town():
     numbers = [set(numbers) for numbers in catalogue.SPLITS.values()]
-    assert sum(len(part) for part in numbers) == len(set.union(*numbers)) == 420
+    assert sum(len(part) for part in numbers) == len(set.union(*numbers)) == 1020
 
 
 def test_lists_what_users_can_name():
     names = [info.name for info in catalogue.scene_infos("test")]
     assert names == [f"scene-{number:04d}" for number in range(101, 111)]
-    assert len(catalogue.scene_infos()) == 420
-    assert len(catalogue.scene_infos("train")) == 400
+    assert len(catalogue.scene_infos()) == 1020
+    assert len(catalogue.scene_infos("train")) == 1000
 
 
 @pytest.mark.parametrize("split", ["val", "test"])
@@ -70,3 +73,17 @@ def test_cameras_are_mirror_images_of_each_other():
 def test_lidar_looks_ahead_with_its_y_axis():
     np.testing.assert_array_equal(LIDAR_TO_EGO[:3, :3] @ [0, 1, 0], [1, 0, 0])
     np.testing.assert_array_equal(LIDAR_TO_EGO[:3, :3] @ [1, 0, 0], [0, -1, 0])
+
+
+def test_the_first_towns_are_still_what_they_were():
+    names = [info.name for info in catalogue.scene_infos(edition=1)]
+    assert names == [f"scene-{number:04d}" for number in range(101, 111)]
+    for number in range(101, 111):
+        vector_map, driven = first_town(number)
+        parts = [*vector_map.road_segments, *vector_map.lanes, *vector_map.walkways]
+        assert all(part.is_valid for part in (*parts, *(crossing.polygon for crossing in vector_map.crossings)))
+        road = shapely.union_all(vector_map.road_segments)
+        assert shapely.contains_xy(road, driven.ego_to_global[:, :2, 3]).all()
+    vector_map, driven = first_town(103)
+    assert len(vector_map.road_segments) == 21
+    assert md5(np.round(driven.ego_to_global, 6).tobytes()).hexdigest() == "38f1369487702b6cb8eec962f6ff8e1e"

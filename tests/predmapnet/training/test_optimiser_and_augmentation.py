@@ -12,8 +12,6 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.image_input import mirror_rig
 from predmapnet.scenes import Camera, FrameTruth
 from predmapnet.training.data.augmentation import (
-    AugmentationSettings,
-    change_light,
     mirror_images,
     mirror_pose,
     mirror_truth,
@@ -78,14 +76,3 @@ def pixels_of(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarra
     seen = rays[:, 2] > 0.5
     projected = rays[seen] @ camera.intrinsics.T
     return seen, projected[:, :2] / projected[:, 2:]
-
-
-def test_light_is_repeatable_and_bounded() -> None:
-    images = np.random.default_rng(0).integers(60, 200, (6, 16, 32, 3), dtype=np.uint8)
-    settings = AugmentationSettings()
-    once = change_light(images, settings, np.random.default_rng(7))
-    again = change_light(images, settings, np.random.default_rng(7))
-    assert np.array_equal(once, again)
-    assert not np.array_equal(once, images)
-    still = AugmentationSettings(gain=0, colour=0, offset=0, noise=0)
-    assert np.array_equal(change_light(images, still, np.random.default_rng(7)), images)

@@ -1,0 +1,61 @@
+"""What is built of a town stretch by stretch, before it is assembled into a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import Polygon
+
+from predmapnet.demo_world.town.junctions import ArmReach
+from predmapnet.demo_world.town.lane_graph import Carriageway
+from predmapnet.demo_world.world import Crossing, Divider, Hatching
+
+Float = NDArray[np.float64]
+
+
+@dataclass
+class Works:
+    """All that has been built so far; ``lanes`` are polygons with their centre lines."""
+
+    paved: list[shapely.Geometry] = field(default_factory=list)
+    islands: list[Polygon] = field(default_factory=list)
+    crossings: list[Crossing] = field(default_factory=list)
+    dividers: list[Divider] = field(default_factory=list)
+    markings: list[Divider] = field(default_factory=list)
+    hatchings: list[Hatching] = field(default_factory=list)
+    parking: list[Polygon] = field(default_factory=list)
+    stop_lines: list[Polygon] = field(default_factory=list)
+    lanes: list[tuple[Polygon, Float]] = field(default_factory=list)
+    grass: list[Polygon] = field(default_factory=list)
+    carriageways: list[Carriageway] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A street between two nodes: its index, the stations of both ends, and how far the junctions reach."""
+
+    street: int
+    start: float
+    end: float
+    nodes: tuple[int, int]
+    reaches: tuple[ArmReach | None, ArmReach | None]
+
+    def inner(self, of: str) -> tuple[float, float]:
+        """Stations between the junctions, by ``clear``, ``stop`` or ``paint``."""
+        first, last = self.reaches
+        values = [0.0 if reach is None else _distance(reach, of) for reach in (first, last)]
+        return self.start + values[0], self.end - values[1]
+
+
+def _distance(reach: ArmReach, of: str) -> float:
+    if of == "clear":
+        return max(reach.left_clear, reach.right_clear)
+    return reach.stop if of == "stop" else reach.paint
+
+
+def spaced(start: float, end: float, spacing: float = 2.0) -> Float:
+    """Stations from ``start`` to ``end``, both included, at most ``spacing`` metres apart; at least two."""
+    return np.linspace(start, end, max(2, int(np.ceil((end - start) / spacing)) + 1))
