@@ -86,7 +86,10 @@ def list_of(value: Any) -> list[Any] | None:
 
 def whole_numbers_of(value: Any) -> tuple[int, ...]:
     """Return integers of a list; an empty tuple for null. Raises ValueError."""
-    numbers = [number_of(entry) for entry in list_of(value) or ()]
-    if any(number is None or number != round(number) for number in numbers):
-        raise ValueError(f"not all whole numbers: {str(value)[:40]!r}")
-    return tuple(int(number) for number in numbers if number is not None)
+    whole = []
+    for entry in list_of(value) or ():
+        number = number_of(entry)
+        if number is None or number != round(number):
+            raise ValueError(f"not all whole numbers: {str(value)[:40]!r}")
+        whole.append(entry if isinstance(entry, int) else int(number))  # large ids are kept to the last digit
+    return tuple(whole)

@@ -186,7 +186,7 @@ def test_points_off_the_globe_are_refused_and_the_old_file_stays(tmp_path, offse
     [
         ("{", "not JSON"),
         ("[]", "not a GeoJSON FeatureCollection"),
-        ('{"type":"FeatureCollection","features":[{}]}', "feature 0 is not an element"),
+        ('{"type":"FeatureCollection","features":[{}]}', "no feature is an element"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, message):

@@ -108,6 +108,15 @@ def escaped(root):
         path.write_text(path.read_text().replace('"token"', '"\\u0074oken"').replace("samples/", "samples\\/"))
 
 
+def escaped_values(root):
+    path = root / "v1.0-mini" / "ego_pose.json"
+
+    def escape(found):
+        return found[1] + "".join(f"\\u{ord(letter):04x}" for letter in found[2]) + '"'
+
+    path.write_text(re.sub(r'("token": ")([^"]*)"', escape, path.read_text()))
+
+
 def numbers_for_flags(root):
     edit(root, "sample_data", lambda records: [r | {"is_key_frame": int(r["is_key_frame"])} for r in records])
 
@@ -116,7 +125,7 @@ def the_word_radar(root):
     edit(root, "sample_data", lambda records: [r | {"description": "RADAR } { was off"} for r in records])
 
 
-@pytest.mark.parametrize("write", [blanks, nested, escaped, numbers_for_flags, the_word_radar])
+@pytest.mark.parametrize("write", [blanks, nested, escaped, escaped_values, numbers_for_flags, the_word_radar])
 def test_tables_are_read_however_they_are_written(nuscenes_root, write):
     expected = seen(nuscenes_root)
     write(nuscenes_root)
