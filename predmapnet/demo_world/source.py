@@ -11,6 +11,9 @@ from predmapnet.demo_world.catalogue import WORLD_VERSION, default_cache, ensure
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
+DEMO = "demo"
+"""Name of the present demo world."""
+
 
 class DemoSource:
     """Scenes of the demo world; each is rendered into the cache when it is first opened.
@@ -26,7 +29,7 @@ class DemoSource:
     def __init__(self, cache: Path | None = None, edition: int = WORLD_VERSION) -> None:
         """Use a cache folder (None takes the user's own) and an edition of the world, 1 being the first."""
         self.edition = edition
-        self.name = "demo-v1" if edition == 1 else "demo"
+        self.name = "demo-v1" if edition == 1 else DEMO
         self.root = default_cache() if cache is None else Path(cache)
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:

@@ -20,7 +20,7 @@ from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.georeference import Georeference
 from mapfusion.ground import observed_rings
 from predmapnet.datasets.georeference import LocalFrame, local_frame
-from predmapnet.demo_world.source import DemoSource
+from predmapnet.demo_world.source import DEMO
 from predmapnet.errors import value_errors_told
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
@@ -259,7 +259,7 @@ class MappingPipeline:
     def warning(self) -> str:
         """Caveats about the weights, for the user of the command; empty if there are none."""
         warnings = []
-        if not self.source.synthetic and self.mapper.facts.get("data") == DemoSource.name:
+        if not self.source.synthetic and self.mapper.facts.get("data") == DEMO:
             warnings.append(REAL_NOTE)
         if untrained := self.mapper.facts.get("untrained"):
             warnings.append(UNTRAINED_NOTE.format(parts=", ".join(untrained)))

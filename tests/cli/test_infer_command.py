@@ -134,7 +134,7 @@ def test_a_wrong_output_is_told_before_the_work_begins(infer, tmp_path, out, wor
 
 
 def test_two_outputs_may_not_have_one_name(infer):
-    result = infer("scene-0001", "--out", "a", "--recording", "./a")
+    result = infer("scene-0001", "--out", "map.rrd", "--recording", "./map.rrd")
     assert result.code == 2
     assert "same name" in result.err
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.data.photography import (
     PhotographySettings,
     add_noise,
@@ -33,11 +34,13 @@ class AugmentationSettings:
         mirror: probability of swapping left and right.
         photography: light, lenses, sensors and files.
         camera_dropout: probability that one camera of a frame is missing; a single one never is.
+        calibration: how wrong the calibration is that the network is told (single-frame stage).
     """
 
     mirror: float = 0.5
     photography: PhotographySettings = field(default_factory=PhotographySettings)
     camera_dropout: float = 0.05
+    calibration: CalibrationNoise = field(default_factory=CalibrationNoise)
 
 
 def mirror_images(images: Images) -> Images:

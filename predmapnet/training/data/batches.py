@@ -27,6 +27,7 @@ from predmapnet.training.data.augmentation import (
     mirror_pose,
     mirror_truth,
 )
+from predmapnet.training.data.calibration_noise import perturb_calibration
 from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.data.targets import Targets, truth_targets
 
@@ -141,18 +142,19 @@ class SingleFrameBatches:
         """Return the batch of one step."""
         generator = np.random.default_rng([*self._seed, step])
         drawn = generator.choice(len(self._scenes.frame_index), self._batch, p=self._scenes.frame_probability)
-        frames, images, valid = [], [], []
+        frames, images, valid, calibrations = [], [], [], []
         for scene, frame in self._scenes.frame_index[drawn]:
             mirrored = bool(generator.random() < self._augmentation.mirror)
             loaded = self._scenes.load(scene, frame, mirrored)
             frames.append(loaded)
             images.append(change_light(loaded.images, self._augmentation, generator))
             valid.append(drop_camera(len(loaded.images), self._augmentation, generator))
+            calibrations.append(perturb_calibration(loaded.calibration, self._augmentation.calibration, generator))
         return Batch(
             images=pad_cameras(images),
             camera_valid=pad_cameras(valid),
             ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in frames])),
-            calibration=collate_calibrations([frame.calibration for frame in frames]),
+            calibration=collate_calibrations(calibrations),
             targets=truth_targets([frame.truth for frame in frames], self._roi, self._points, RASTER_GRID),
         )
 

@@ -14,13 +14,19 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.clips import ClipTraining
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.data.calibration_noise import CalibrationNoise
+from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import Budget, ClipSettings, StreamSettings, TrainingSettings, plan_run
 from predmapnet.training.single_frame import SingleFrameStage
 from predmapnet.training.temporal import TemporalStage
 
-UNCHANGED = AugmentationSettings(gain=0.0, colour=0.0, offset=0.0, noise=0.0, camera_dropout=0.0)
+UNCHANGED = AugmentationSettings(
+    photography=PhotographySettings(**dict.fromkeys(PhotographySettings.__dataclass_fields__, 0.0)),
+    camera_dropout=0.0,
+    calibration=CalibrationNoise(probability=0.0),
+)
 
 
 def other_car():
