@@ -67,7 +67,8 @@ def _segments(
     plan: StreetPlan, sections: list[CrossSection], stretches: list[Stretch], surface: Polygon
 ) -> tuple[Polygon, ...]:
     """The surface in pieces, stretches first and then junctions, which overlap by 20 cm and so leave no seam."""
-    bands, cutters = [], []
+    bands: list[Polygon] = []
+    cutters: list[Polygon] = []
     for stretch in stretches:
         line, section = plan.streets[stretch.street].line, sections[stretch.street]
         low, high = stretch.inner("clear")

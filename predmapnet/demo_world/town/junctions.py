@@ -57,7 +57,7 @@ class Corner:
     @property
     def is_flat(self) -> bool:
         """Whether the kerb just goes on."""
-        return self.gap > FLAT
+        return bool(self.gap > FLAT)
 
 
 @dataclass
