@@ -28,7 +28,7 @@ def token(*names: object) -> str:
     return hashlib.md5("/".join(map(str, names)).encode(), usedforsecurity=False).hexdigest()
 
 
-def file_name(scene: str, channel: str, timestamp: int) -> str:
+def sample_file_name(scene: str, channel: str, timestamp: int) -> str:
     """Path of one measurement below the root; ``timestamp`` in nanoseconds."""
     ending = "pcd.bin" if channel == LIDAR else "jpg"
     return f"samples/{channel}/demo-{scene}__{channel}__{timestamp // 1000}.{ending}"
@@ -181,7 +181,7 @@ def _sample_data(name: str, rig: Rig, trajectory: Trajectory) -> list[Record]:
             "is_key_frame": True,
             "height": height,
             "width": width,
-            "filename": file_name(name, channel, int(trajectory.timestamps[index])),
+            "filename": sample_file_name(name, channel, int(trajectory.timestamps[index])),
             **_neighbours(count, index, name, "sample_data", channel),
         }
         for index in range(count)

@@ -18,7 +18,7 @@ import orjson
 
 from predmapnet import __version__
 from predmapnet.demo_world.nuscenes.map_expansion import build_expansion, draw_prior
-from predmapnet.demo_world.nuscenes.tables import LIDAR, LOCATION, build_tables, file_name
+from predmapnet.demo_world.nuscenes.tables import LIDAR, LOCATION, build_tables, sample_file_name
 from predmapnet.demo_world.render.lidar import scan
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG
@@ -109,9 +109,11 @@ def _render_frames(world: World, root: Path, rig: Rig, progress: Progress | None
     def write_frame(index: int) -> None:
         timestamp = int(world.trajectory.timestamps[index])
         for channel, rendered in renderer.render_frame(rig, index).items():
-            path = root / file_name(world.name, channel, timestamp)
+            path = root / sample_file_name(world.name, channel, timestamp)
             _write_image(path, rendered.image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-        _write_bytes(root / file_name(world.name, LIDAR, timestamp), scan(renderer, index).astype("<f4").tobytes())
+        _write_bytes(
+            root / sample_file_name(world.name, LIDAR, timestamp), scan(renderer, index).astype("<f4").tobytes()
+        )
 
     _in_threads(write_frame, count, lambda done: progress(done, count, f"rendering {world.name}") if progress else None)
 

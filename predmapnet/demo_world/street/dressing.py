@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 
 from predmapnet.demo_world.street.solid_list import SolidList
-from predmapnet.demo_world.street.traffic import Parking, drive, ego_corridor, footprint
+from predmapnet.demo_world.street.traffic import Parking, add_moving_traffic, ego_corridor, footprint
 from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
 
 Float = NDArray[np.float64]
@@ -189,5 +189,5 @@ def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, 
     busy = generator.uniform(0.35, 0.9)
     parking.in_bays(vector_map.parking, busy)
     parking.along_kerbs(road, sight, 0.34 * busy)
-    drive(solids, vector_map, road, trajectory, seed)
+    add_moving_traffic(solids, vector_map, road, trajectory, seed)
     return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids())

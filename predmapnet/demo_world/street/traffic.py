@@ -116,7 +116,9 @@ class Parking:
                     self.park(ends[1], yaw + generator.normal(0, 0.02), vehicle_size(generator))
 
 
-def drive(solids: SolidList, vector_map: VectorMap, road: shapely.Geometry, trajectory: Trajectory, seed: int) -> None:
+def add_moving_traffic(
+    solids: SolidList, vector_map: VectorMap, road: shapely.Geometry, trajectory: Trajectory, seed: int
+) -> None:
     """Add moving vehicles that follow the ego car's road: ahead, behind, beside and oncoming.
 
     Each is a chain of pieces, one per key frame, so that it follows bends; a piece that would leave the road, stand on
