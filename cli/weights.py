@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from predmapnet.weights.imagenet_import import BackboneReport
     from predmapnet.weights.inspection import WeightsInfo
     from predmapnet.weights.maptracker_import import ImportReport
 
@@ -16,22 +17,27 @@ weights = typer.Typer(name="weights", help="Import public weights, inspect weigh
 
 @weights.command("import")
 def import_weights(
-    checkpoint: Annotated[Path, typer.Argument(help="Published checkpoint of MapTracker (.pth).", metavar="FILE")],
+    checkpoint: Annotated[
+        Path,
+        typer.Argument(help="Published checkpoint of MapTracker, or an ImageNet ResNet-50 (.pth).", metavar="FILE"),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Weights to write (.safetensors).")],
     preset: Annotated[
         str | None,
         typer.Option(
             help="MapTracker as it is (maptracker-nuscenes, maptracker-av2; by default as the file says), or under the "
-            "modules of the paper (paper-nuscenes, paper-av2), or a JSON file.",
+            "modules of the paper (paper-nuscenes, paper-av2), or a JSON file. An ImageNet backbone goes into "
+            "paper-nuscenes by default.",
             show_default=False,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the paper's modules, for which MapTracker has no weights.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of what the file does not hold, which begins at random.")] = 0,
 ) -> None:
-    """Turn a MapTracker checkpoint into weights for PredMapNet.
+    """Turn a MapTracker checkpoint, or an ImageNet ResNet-50, into weights for PredMapNet.
 
     Map with them (`predmapnet infer --weights FILE`), or go on training. With the modules of the paper they have to be
-    trained before they map well, since the modules begin at random.
+    trained before they map well, since the modules begin at random. A ResNet-50 (names of torchvision, mmcv, Detectron
+    or Detectron2) becomes the image backbone of a network to train: `predmapnet train --init FILE`.
 
     Nothing in the checkpoint is executed; entries that do not fit are an error.
     """
@@ -45,10 +51,16 @@ def import_weights(
     config = None if preset is None else load_config(preset)
     from predmapnet.weights.checkpoint import save_checkpoint
     from predmapnet.weights.files import weights_hash
+    from predmapnet.weights.imagenet_import import import_imagenet_backbone, is_imagenet_backbone
     from predmapnet.weights.inspection import parts_of
     from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint
 
-    network, report = import_maptracker(read_official_checkpoint(checkpoint), config, seed)
+    official = read_official_checkpoint(checkpoint)
+    report: ImportReport | BackboneReport
+    if is_imagenet_backbone(official):
+        network, report = import_imagenet_backbone(official, config or load_config("paper-nuscenes"), seed)
+    else:
+        network, report = import_maptracker(official, config, seed)
     facts: dict[str, object] = {"imported_from": checkpoint.name, "sha256_of_source": weights_hash(checkpoint)}
     if report.fresh:
         facts |= {"untrained": parts_of(report.fresh), "seed": seed}
@@ -74,19 +86,13 @@ def inspect_weights(
     _say_weights(inspect_file(file), names)
 
 
-def _say_import(report: ImportReport, name: str, path: Path) -> None:
+def _say_import(report: ImportReport | BackboneReport, name: str, path: Path) -> None:
     from cli.console import out
     from predmapnet.weights.inspection import parts_of
 
     out.print(f"{len(report.mapped)} entries mapped, none unexplained", markup=False)
-    reasons: dict[str, int] = {}
-    for reason in report.ignored.values():
-        kind = "repetitions of a branch that all decoder layers share" if reason.startswith("repeats") else reason
-        reasons[kind] = reasons.get(kind, 0) + 1
-    for reason, count in reasons.items():
-        out.print(f"{count} ignored: {reason}", markup=False)
-    if report.missing:
-        out.print(f"{len(report.missing)} missing that inference does without (counters of batches)", markup=False)
+    for line in report.remarks():
+        out.print(line, markup=False)
     if report.fresh:
         parts = ", ".join(parts_of(report.fresh))
         out.print(f"{len(report.fresh)} tensors begin at random and have to be trained: {parts}", markup=False)

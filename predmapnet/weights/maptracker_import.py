@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -47,6 +48,15 @@ class ImportReport:
     ignored: dict[str, str] = field(default_factory=dict)
     missing: list[str] = field(default_factory=list)
     fresh: list[str] = field(default_factory=list)
+
+    def remarks(self) -> list[str]:
+        """Say what was ignored and what is missing, a line per reason."""
+        repetitions = "repetitions of a branch that all decoder layers share"
+        reasons = Counter(repetitions if reason.startswith("repeats") else reason for reason in self.ignored.values())
+        lines = [f"{count} ignored: {reason}" for reason, count in reasons.items()]
+        if self.missing:
+            lines.append(f"{len(self.missing)} missing that inference does without (counters of batches)")
+        return lines
 
 
 def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
