@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mapfusion import ElementKind, GlobalMap
+from mapfusion import GlobalMap
+from mapfusion.colours import BACKGROUND, KIND_COLOURS, web_colour
 from mapfusion.formats.geojson import read_geojson
 
-COLOURS = {ElementKind.PED_CROSSING: "#56b4e9", ElementKind.DIVIDER: "#ffb000", ElementKind.BOUNDARY: "#40d689"}
 PIXELS_PER_METRE = 4.0
 MARGIN_METRES = 10.0
 
@@ -25,10 +25,12 @@ def draw(global_map: GlobalMap) -> str:
         # SVG's y points down, the map's north.
         pixels = (element.points - [low[0], high[1]]) * [PIXELS_PER_METRE, -PIXELS_PER_METRE]
         corners = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
-        style = f'stroke="{COLOURS[element.kind]}" stroke-opacity="{0.3 + 0.7 * element.confidence:.2f}"'
+        style = (
+            f'stroke="{web_colour(KIND_COLOURS[element.kind])}" stroke-opacity="{0.3 + 0.7 * element.confidence:.2f}"'
+        )
         lines.append(f'<polyline points="{corners}" fill="none" stroke-width="2" {style}/>')
     size = f'width="{width:.0f}" height="{height:.0f}"'
-    background = '<rect width="100%" height="100%" fill="#0e1014"/>'
+    background = f'<rect width="100%" height="100%" fill="{web_colour(BACKGROUND)}"/>'
     return "\n".join([f'<svg xmlns="http://www.w3.org/2000/svg" {size}>', background, *lines, "</svg>\n"])
 
 

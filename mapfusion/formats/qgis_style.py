@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mapfusion.colours import KIND_COLOURS
 from mapfusion.elements import ElementKind
 from mapfusion.files import write_whole
-
-COLOURS = {
-    ElementKind.PED_CROSSING: (86, 180, 233),
-    ElementKind.DIVIDER: (255, 176, 0),
-    ElementKind.BOUNDARY: (64, 214, 137),
-}
-"""Red, green, blue."""
 
 WIDTHS = {ElementKind.PED_CROSSING: 0.3, ElementKind.DIVIDER: 0.4, ElementKind.BOUNDARY: 0.6}
 """Millimetres on the screen."""
@@ -53,7 +47,7 @@ def _write(path: Path, symbol: str, kinds: list[ElementKind]) -> None:
 
 
 def _symbol(place: int, symbol: str, kind: ElementKind) -> str:
-    red, green, blue = COLOURS[kind]
+    red, green, blue = KIND_COLOURS[kind]
     solid, pale = f"{red},{green},{blue},255", f"{red},{green},{blue},70"
     if symbol == "line":
         layer = _layer("SimpleLine", {"line_color": solid, "line_width": f"{WIDTHS[kind]}", "line_width_unit": "MM"})

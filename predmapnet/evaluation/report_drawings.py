@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Float
+from mapfusion.colours import KIND_COLOURS, darker, web_colour
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.evaluation.precision_recall import PrecisionRecallCurve
 
-COLOURS = {ElementKind.PED_CROSSING: "#2f6fde", ElementKind.DIVIDER: "#e07b1f", ElementKind.BOUNDARY: "#2e9e4f"}
+COLOURS = {kind: web_colour(darker(colour, 0.2)) for kind, colour in KIND_COLOURS.items()}
+"""A little darker than on the dark background of a map, since a report is white."""
 _SHADES = ("#9fb3c8", "#486581", "#102a43")
 _SIDE = 240
 _MARGIN = 34

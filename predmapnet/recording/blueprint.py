@@ -5,6 +5,7 @@ from __future__ import annotations
 import rerun as rr
 import rerun.blueprint as rrb
 
+from mapfusion.colours import BACKGROUND
 from predmapnet.scenes import Rig
 
 CAMERA_ORDER = (
@@ -23,8 +24,6 @@ CAMERA_ORDER = (
     "ring_rear_right",
 )
 """Order of the camera views: as one looks around, front row first."""
-
-BACKGROUND = (14, 16, 20)
 
 
 def scene_blueprint(rig: Rig, bev_shape: tuple[int, int], play: bool = False) -> rrb.Blueprint:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
+from mapfusion.colours import KIND_COLOURS
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.formats.by_suffix import read_map
 from predmapnet.errors import UserError
 from predmapnet.recording.blueprint import WORLD_COORDINATES, map_blueprint
-from predmapnet.recording.palette import KIND_COLOURS
 
 
 def log_map_file(recording: rr.RecordingStream, path: Path) -> None:

@@ -1,35 +1,14 @@
-"""Colours of the recording: one per kind, distinct to colour-blind eyes, readable on a dark background."""
+"""Rasters in the colours of their kinds."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.colours import BACKGROUND, KIND_COLOURS
 from mapfusion.elements import ElementKind
 
 Bytes = NDArray[np.uint8]
-
-KIND_COLOURS: dict[ElementKind, tuple[int, int, int]] = {
-    ElementKind.PED_CROSSING: (86, 180, 233),
-    ElementKind.DIVIDER: (255, 176, 0),
-    ElementKind.BOUNDARY: (64, 214, 137),
-}
-"""Okabe and Ito's sky blue, orange and green, brightened."""
-
-TRUTH_COLOUR = (125, 125, 130)
-"""Ground truth: a grey that stays behind everything."""
-
-
-def lighter(colour: tuple[int, int, int], share: float = 0.55) -> tuple[int, int, int]:
-    """Blend a colour with white; forecasts are drawn so."""
-    red, green, blue = (round(channel + (255 - channel) * share) for channel in colour)
-    return red, green, blue
-
-
-def darker(colour: tuple[int, int, int], share: float = 0.45) -> tuple[int, int, int]:
-    """Blend a colour with black; the global map is drawn so, behind the current tracks."""
-    red, green, blue = (round(channel * (1 - share)) for channel in colour)
-    return red, green, blue
 
 
 def raster_picture(rasters: NDArray[np.float32], kinds: NDArray[np.int64]) -> Bytes:
@@ -42,7 +21,7 @@ def raster_picture(rasters: NDArray[np.float32], kinds: NDArray[np.int64]) -> By
     Returns:
         ``(rows, columns, 3) uint8``, near black where there is nothing.
     """
-    background = np.array([14.0, 16.0, 20.0])
+    background = np.array(BACKGROUND, dtype=np.float64)
     if len(rasters) == 0:
         return np.broadcast_to(background.astype(np.uint8), (*rasters.shape[1:], 3)).copy()
     palette = np.array([KIND_COLOURS[kind] for kind in ElementKind], dtype=np.float64)

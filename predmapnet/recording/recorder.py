@@ -15,10 +15,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Float
+from mapfusion.colours import KIND_COLOURS, TRUTH_COLOUR, darker, lighter
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from predmapnet.mapping import MapSnapshot, Step
 from predmapnet.recording.blueprint import WORLD_COORDINATES, scene_blueprint
-from predmapnet.recording.palette import KIND_COLOURS, TRUTH_COLOUR, darker, lighter, raster_picture
+from predmapnet.recording.palette import raster_picture
 from predmapnet.recording.projection import bev_pixels, dashes, project_line
 from predmapnet.scenes import Camera, Scene
 

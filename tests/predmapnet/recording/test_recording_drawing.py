@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapfusion.colours import KIND_COLOURS
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
-from predmapnet.recording.palette import KIND_COLOURS, raster_picture
+from predmapnet.recording.palette import raster_picture
 from predmapnet.recording.projection import bev_pixels, dashes, densify, project_line, true_runs
 from predmapnet.scenes import Camera
 
