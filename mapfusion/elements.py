@@ -81,6 +81,7 @@ class FrameMap:
         history_masks: ``(n, rows, columns) float32``, raster memory of each element, same grid convention.
         visible: rings ``(k, 2) float64``, metres, ego frame, around the ground that could be seen at that instant; a
             ring within another is a hole; see :func:`mapfusion.ground.visible_ground`. ``None``: all of the ROI.
+        ground_height: z of the road under the car, metres, ego frame: zero where the ego origin lies on the road.
     """
 
     timestamp: int
@@ -94,6 +95,7 @@ class FrameMap:
     segmentation: NDArray[np.float32] | None = None
     history_masks: NDArray[np.float32] | None = None
     visible: tuple[Float, ...] | None = None
+    ground_height: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timestamp", int(self.timestamp))
@@ -142,6 +144,7 @@ class MapElement:
             not average out is in it (:mod:`mapfusion.integrate.uncertainty`); an offset of the poses as a whole is not.
         sources: names of the drives, or of the maps if those do not name any, that it comes from, ascending.
         source_track_ids: ids of the tracks in each of the sources, in their order.
+        heights: ``(n,) float64``, metres, of the road at each vertex, z of the global frame, if known.
     """
 
     kind: ElementKind
@@ -154,6 +157,7 @@ class MapElement:
     deviation: Float | None = None
     sources: tuple[str, ...] = ()
     source_track_ids: tuple[tuple[int, ...], ...] = ()
+    heights: Float | None = None
 
     @property
     def length(self) -> float:

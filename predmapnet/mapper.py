@@ -172,7 +172,8 @@ class Mapper:
             selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
         )
         working = (camera for camera, valid in zip(frame.rig, images.valid, strict=True) if valid)
-        return replace(frame_map, visible=ground_in_view(working, self.roi)), state
+        road = float(np.median([camera.ground_height for camera in frame.rig]))
+        return replace(frame_map, visible=ground_in_view(working, self.roi), ground_height=road), state
 
     def _geometry(self, calibration: Calibration) -> ViewGeometry:
         """Return the geometry of a calibration, from the few that were used last."""

@@ -14,6 +14,7 @@ from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
 from mapfusion.ground import seen_along
 from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
+from mapfusion.road_heights import RoadHeights
 from predmapnet.errors import UserError
 from predmapnet.scenes import Frame, Scene
 
@@ -69,7 +70,7 @@ class SceneRun:
     """A mapped scene.
 
     Attributes:
-        global_map: the map of the whole drive, without provenance.
+        global_map: the map of the whole drive, without provenance, with heights where the poses tell them.
         frames: the frames that were mapped.
         frame_maps: one per frame, without rasters.
         seconds: wall time from the first image to the last frame.
@@ -123,7 +124,7 @@ def map_scene(
         for observer in observers:
             observer.observe(step, integrator.map)
     check_left_out(len(frames), len(fused), integrator.rejections)
-    global_map = integrator.map()
+    global_map = RoadHeights.along(fused).lifted_map(integrator.map())
     seconds = perf_counter() - start
     for observer in observers:
         observer.end(global_map)

@@ -22,6 +22,10 @@ from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import InvertibleGeoreference
+from mapfusion.road_heights import filled
+
+HEIGHTS = "heights_m"
+"""Column with the heights of the vertices, in formats whose geometries have none."""
 
 SURE = 1.0
 """Confidence of an element that a person drew."""
@@ -47,6 +51,7 @@ class _Element:
     place: int
     kind: ElementKind
     degrees: Float
+    heights: Float | None
     deviation: Float | None
     confidence: float | None
     observations: float | None
@@ -114,7 +119,8 @@ def _elements(place: int, feature: Feature, notes: ReadingNotes) -> list[_Elemen
             place,
             kind,
             feature.to_degrees.positions(path.positions),
-            _deviation(properties.get("deviation_m"), path, place, notes),
+            _heights(path, properties, place, notes),
+            _deviation(path, properties, place, notes),
             _told(number_of, properties, "confidence"),
             _told(number_of, properties, "observations"),
             _told(time_of, properties, "first_seen"),
@@ -148,27 +154,48 @@ def _told(read: Any, properties: Mapping[str, Any], name: str) -> Any:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _deviation(value: Any, path: DrawnPath, place: int, notes: ReadingNotes) -> Float | None:
-    """Return the deviation of each vertex; interpolated where vertices were added or removed."""
+def _heights(path: DrawnPath, properties: Mapping[str, Any], place: int, notes: ReadingNotes) -> Float | None:
+    """Return the height of each vertex, from the geometry or the column that stands in for it; interpolated in gaps."""
+    heights = path.heights
+    if heights is None:
+        heights = None if path.rows is None else _numbers(properties, HEIGHTS, path, place, notes)
+    if heights is None:
+        return None
+    if np.isnan(heights).any():
+        notes.add("vertices without a height: interpolated along the line", place)
+    return filled(heights, path.positions)
+
+
+def _deviation(path: DrawnPath, properties: Mapping[str, Any], place: int, notes: ReadingNotes) -> Float | None:
+    """Return the deviation of each vertex, none of them negative."""
+    stored = _numbers(properties, "deviation_m", path, place, notes)
+    if stored is None or (stored >= 0.0).all():
+        return stored
+    notes.add("deviation_m is not one number a vertex: left out", place)
+    return None
+
+
+def _numbers(
+    properties: Mapping[str, Any], name: str, path: DrawnPath, place: int, notes: ReadingNotes
+) -> Float | None:
+    """Return the numbers of a column, one a vertex; interpolated where vertices were added or removed."""
     try:
-        numbers = [number_of(entry) for entry in list_of(value) or ()]
+        numbers = [number_of(entry) for entry in list_of(properties.get(name)) or ()]
     except ValueError:
         numbers = [None]
     if not numbers:
         return None
-    if any(number is None or number < 0.0 for number in numbers):
-        notes.add("deviation_m is not one number a vertex: left out", place)
-        return None
-    stored = np.array(numbers, dtype=np.float64)
-    if path.rows is None:
-        return np.full(len(path.positions), stored.max())
-    if len(stored) == path.stored:
-        return np.asarray(stored[path.rows])
-    if path.stored > 1 and len(stored) > 1:
-        notes.add("vertices were added or removed: deviation_m is interpolated along the line", place)
-        along = np.linspace(0.0, len(stored) - 1.0, path.stored)
-        return np.asarray(np.interp(along, np.arange(len(stored)), stored)[path.rows])
-    notes.add("deviation_m is not one number a vertex: left out", place)
+    if not any(number is None for number in numbers):
+        stored = np.array(numbers, dtype=np.float64)
+        if path.rows is None:
+            return np.full(len(path.positions), stored.max())
+        if len(stored) == path.stored:
+            return np.asarray(stored[path.rows])
+        if path.stored > 1 and len(stored) > 1:
+            notes.add(f"vertices were added or removed: {name} is interpolated along the line", place)
+            along = np.linspace(0.0, len(stored) - 1.0, path.stored)
+            return np.asarray(np.interp(along, np.arange(len(stored)), stored)[path.rows])
+    notes.add(f"{name} is not one number a vertex: left out", place)
     return None
 
 
@@ -211,6 +238,7 @@ def _completed(found: list[_Element], georeference: InvertibleGeoreference, note
                 deviation=element.deviation,
                 sources=element.sources,
                 source_track_ids=element.source_track_ids,
+                heights=element.heights,
             )
         )
     return elements

@@ -24,18 +24,21 @@ class DrawnPath:
         positions: ``(n, 2) float64``, in the reference system of the file; a ring ends where it begins.
         rows: ``(n,)`` position of each vertex in the file, None where the vertices are new.
         stored: number of positions in the file.
+        heights: ``(n,)``, metres, NaN where the file has none; None where it has none at all.
     """
 
     positions: Float
     rows: Any
     stored: int
+    heights: Float | None = None
 
 
 def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) -> list[DrawnPath]:
     """Return the lines (or rings) of a GeoJSON geometry.
 
-    Parts of multi-part geometries come one by one, heights are left out, open rings are closed, rings that cross
-    themselves are split, and what has no length or no area is left out; ``notes`` says so.
+    Parts of multi-part geometries come one by one, open rings are closed, rings that cross themselves are split (and
+    lose their heights), and what has no length or no area is left out; ``notes`` says so. A height of exactly 0 is
+    none: programs write it where they know none.
 
     Args:
         geometry: as in GeoJSON; None for a feature without one.
@@ -60,16 +63,16 @@ def paths_of(geometry: Any, is_ring: bool, feature: int, notes: ReadingNotes) ->
             continue
         if len(rings) > 1:
             notes.add("an area with holes: the holes are left out", feature)
-        positions = _positions(rings[0], feature, notes)
+        positions, heights = _positions(rings[0])
         if is_ring:
-            found.extend(_rings(positions, feature, notes))
+            found.extend(_rings(positions, heights, feature, notes))
             continue
         if name == "Polygon":
             notes.add("a line that is drawn as an area: its outline is taken", feature)
         if len(positions) < 2 or not np.ptp(positions, axis=0).any():
             notes.add("a line without length: left out", feature)
         else:
-            found.append(DrawnPath(positions, np.arange(len(positions)), len(positions)))
+            found.append(DrawnPath(positions, np.arange(len(positions)), len(positions), heights))
     return found
 
 
@@ -92,30 +95,31 @@ def _parts(geometry: Any, feature: int, notes: ReadingNotes) -> Iterator[tuple[s
         raise ValueError(f"a geometry must be a LineString or a Polygon, not {str(name)[:40]!r}")
 
 
-def _positions(coordinates: Any, feature: int, notes: ReadingNotes) -> Float:
-    """Return ``(n, 2)`` positions; heights are left out."""
+def _positions(coordinates: Any) -> tuple[Float, Float | None]:
+    """Return ``(n, 2)`` positions, and their heights if there are any."""
     if not isinstance(coordinates, (list, tuple)):
         raise ValueError(f"its coordinates are not a list but {str(coordinates)[:40]!r}")
     if not coordinates:
-        return np.zeros((0, 2))
+        return np.zeros((0, 2)), None
     try:
-        depths = {len(position) for position in coordinates}
-        flat = coordinates if depths == {2} else [position[:2] for position in coordinates]
-        positions = np.array(flat, dtype=np.float64)
+        flat = all(len(position) == 2 for position in coordinates)
+        positions = np.array(coordinates if flat else [position[:2] for position in coordinates], dtype=np.float64)
+        third = [] if flat else [position[2] if len(position) > 2 else np.nan for position in coordinates]
+        heights = np.array(third, dtype=np.float64)
     except (TypeError, ValueError, KeyError) as error:
         raise ValueError(f"its coordinates are not positions: {str(coordinates)[:60]}") from error
     if positions.ndim != 2 or positions.shape[1] != 2 or not np.isfinite(positions).all():
         raise ValueError(f"its coordinates are not positions of two numbers: {str(coordinates)[:60]}")
-    if max(depths) > 2:
-        notes.add("heights are left out")
-    return positions
+    heights = np.where(np.isfinite(heights) & (heights != 0.0), heights, np.nan)
+    return positions, None if np.isnan(heights).all() else heights
 
 
-def _rings(positions: Float, feature: int, notes: ReadingNotes) -> list[DrawnPath]:
+def _rings(positions: Float, heights: Float | None, feature: int, notes: ReadingNotes) -> list[DrawnPath]:
     """Return the rings that a drawn ring stands for: one, unless it crosses itself."""
     stored, rows = len(positions), np.arange(len(positions))
     if stored and not np.array_equal(positions[0], positions[-1]):
-        positions, rows = np.vstack([positions, positions[:1]]), np.append(rows, 0)
+        rows = np.append(rows, 0)
+        positions = positions[rows]
         if len(positions) >= 4:
             notes.add("a ring that was not closed: closed", feature)
     if len(positions) < 4:
@@ -123,13 +127,14 @@ def _rings(positions: Float, feature: int, notes: ReadingNotes) -> list[DrawnPat
         return []
     polygon = shapely.Polygon(positions)
     if polygon.is_valid and polygon.area > 0.0:
-        return [DrawnPath(positions, rows, stored)]
+        return [DrawnPath(positions, rows, stored, None if heights is None else heights[rows])]
     parts = [part for part in _polygons(shapely.make_valid(polygon)) if part.area > 0.0]
     parts = [part for part in parts if part.area >= SMALLEST_PART * sum(whole.area for whole in parts)]
     if not parts:
         notes.add("a crossing without area: left out", feature)
         return []
-    notes.add("a ring that crosses itself: its parts are taken", feature)
+    lost = "" if heights is None else ", without heights"
+    notes.add(f"a ring that crosses itself: its parts are taken{lost}", feature)
     return [DrawnPath(shapely.get_coordinates(part.exterior), None, stored) for part in parts]
 
 

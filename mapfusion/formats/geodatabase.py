@@ -21,7 +21,7 @@ import shapely.geometry
 
 from mapfusion.elements import GlobalMap
 from mapfusion.files import write_whole
-from mapfusion.formats.features import Feature, map_of
+from mapfusion.formats.features import HEIGHTS, Feature, map_of
 from mapfusion.formats.foreign_values import number_of
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.reading_notes import ReadingNotes
@@ -30,6 +30,8 @@ from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 LINES, CROSSINGS = "lines", "crossings"
 LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")
+FLAT = "FlatGeobuf"
+"""Driver whose layers of lines and areas together have no heights."""
 METADATA = "predmapnet"
 
 
@@ -50,7 +52,7 @@ def write_geodatabase(
     with write_whole(path) as temporary, _plain_folder(temporary) as plain:
         try:
             if path.suffix.lower() == ".fgb":
-                _write_layer(plain, "FlatGeobuf", path.stem, "Unknown", rows, origin)
+                _write_layer(plain, FLAT, path.stem, "Unknown", rows, origin)
                 return
             crossings = [row for row in rows if row[1]["geometry"]["type"] == "Polygon"]
             lines = [row for row in rows if row[1]["geometry"]["type"] == "LineString"]
@@ -123,6 +125,8 @@ def _write_layer(
     for name in LISTS:
         texts = [json.dumps(row[name]) if name in row else None for row in properties]
         columns[name] = np.array(texts, dtype=object)
+    if driver == FLAT:
+        columns[HEIGHTS] = np.array([_heights_text(feature["geometry"]) for _, feature in rows], dtype=object)
     shapes = np.array([shapely.geometry.shape(feature["geometry"]) for _, feature in rows], dtype=object)
     raw.write(
         path,
@@ -131,10 +135,15 @@ def _write_layer(
         list(columns),
         layer=layer,
         driver=driver,
-        geometry_type=geometry_type,
+        geometry_type=geometry_type + (" Z" if driver != FLAT and shapely.has_z(shapes).any() else ""),
         crs="EPSG:4326",
         layer_metadata={METADATA: json.dumps(dict(origin))},
     )
+
+
+def _heights_text(geometry: Mapping[str, Any]) -> str | None:
+    positions = geometry["coordinates"][0] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    return json.dumps([height for _, _, height in positions]) if len(positions[0]) == 3 else None
 
 
 def _layers(plain: Path, path: Path, notes: ReadingNotes) -> list[str]:

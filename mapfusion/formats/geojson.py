@@ -26,6 +26,9 @@ from mapfusion.georeference import Georeference, InvertibleGeoreference
 DECIMALS = 10
 """Digits of longitude and latitude: 1e-10 degrees are 0.01 mm."""
 
+HEIGHT_DECIMALS = 3
+"""Digits of heights, metres."""
+
 
 def write_geojson(
     global_map: GlobalMap,
@@ -69,8 +72,8 @@ class GeoJsonWriter:
         self._georeference = georeference
         self._provenance = provenance
         self._count = 0
-        self._low = np.full(2, np.inf)
-        self._high = np.full(2, -np.inf)
+        self._low = np.full(3, np.inf)
+        self._high = np.full(3, -np.inf)
 
     def __enter__(self) -> Self:
         self._stack = ExitStack()
@@ -88,14 +91,17 @@ class GeoJsonWriter:
         """Append one element; raises ValueError for one that does not lie on the globe."""
         feature = feature_of(element, self._georeference)
         points = _positions(feature)
-        self._low, self._high = np.minimum(self._low, points.min(axis=0)), np.maximum(self._high, points.max(axis=0))
+        axes = points.shape[1]
+        self._low[:axes] = np.minimum(self._low[:axes], points.min(axis=0))
+        self._high[:axes] = np.maximum(self._high[:axes], points.max(axis=0))
         self._body.write((",\n" if self._count else "\n") + json.dumps(feature, separators=(",", ":"), allow_nan=False))
         self._count += 1
 
     def _finish(self) -> None:
         document: dict[str, Any] = {"type": "FeatureCollection"}
         if self._count:
-            document["bbox"] = [*self._low.tolist(), *self._high.tolist()]
+            axes = np.isfinite(self._low)
+            document["bbox"] = [*self._low[axes].tolist(), *self._high[axes].tolist()]
         document["predmapnet"] = origin_of(self._provenance, self._georeference)
         head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
         self._body.seek(0)
@@ -148,25 +154,28 @@ def _reference_system(member: Any) -> str:
     return str(properties.get("name", "")) if isinstance(properties, dict) else ""
 
 
-def geometry_of(kind: ElementKind, points: Float, georeference: Georeference) -> tuple[dict[str, Any], bool]:
+def geometry_of(
+    kind: ElementKind, points: Float, georeference: Georeference, heights: Float | None = None
+) -> tuple[dict[str, Any], bool]:
     """Return the GeoJSON geometry of a line or ring, metres, and whether the ring was turned; ValueError off the globe.
 
-    Rings turn counter-clockwise.
+    Rings turn counter-clockwise. With heights, positions have three numbers.
     """
     degrees = np.round(georeference.to_wgs84(points), DECIMALS)
     if not (np.isfinite(degrees).all() and (np.abs(degrees) <= [180.0, 90.0]).all()):
         raise ValueError(f"a {kind.label} lies outside the globe: the georeference does not fit the map")
+    positions = degrees if heights is None else np.column_stack([degrees, np.round(heights, HEIGHT_DECIMALS)])
     if not kind.is_ring:
-        return {"type": "LineString", "coordinates": degrees.tolist()}, False
-    degrees[-1] = degrees[0]
+        return {"type": "LineString", "coordinates": positions.tolist()}, False
+    positions[-1] = positions[0]
     x, y = (degrees - degrees[0]).T
     turned = float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0
-    return {"type": "Polygon", "coordinates": [degrees[:: -1 if turned else 1].tolist()]}, turned
+    return {"type": "Polygon", "coordinates": [positions[:: -1 if turned else 1].tolist()]}, turned
 
 
 def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any]:
     """Return an element as a GeoJSON feature, which every format writes; raises ValueError off the globe."""
-    geometry, turned = geometry_of(element.kind, element.points, georeference)
+    geometry, turned = geometry_of(element.kind, element.points, georeference, element.heights)
     properties: dict[str, Any] = {
         "kind": element.kind.label,
         "confidence": round(element.confidence, 4),

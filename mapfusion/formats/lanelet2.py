@@ -104,9 +104,11 @@ def _nodes(element: MapElement, feature: Mapping[str, Any], first: int) -> Itera
     local = element.points[:-1] if ring else element.points
     if ring and not shapely.LinearRing(element.points).is_ccw:
         local = element.points[::-1][:-1]
-    for number, ((longitude, latitude), (x, y)) in enumerate(zip(positions, local.tolist(), strict=True), start=first):
+    for number, (position, (x, y)) in enumerate(zip(positions, local.tolist(), strict=True), start=first):
+        longitude, latitude, *height = position
         yield (
             f'  <node id="{number}" visible="true" version="1" lat="{latitude!r}" lon="{longitude!r}">\n'
+            f'    <tag k="ele" v="{height[0] if height else 0.0}"/>\n'
             f'    <tag k="local_x" v="{x:.4f}"/>\n    <tag k="local_y" v="{y:.4f}"/>\n  </node>\n'
         )
 
@@ -116,6 +118,11 @@ def _way(kind: ElementKind, feature: Mapping[str, Any], first: int, last: int) -
     tags = {"type": TYPES[kind], **{PREFIX + key: _text(value) for key, value in feature["properties"].items()}}
     nodes = "".join(f'    <nd ref="{reference}"/>\n' for reference in references)
     return nodes + "".join(f"    <tag k={quoteattr(key)} v={quoteattr(value)}/>\n" for key, value in tags.items())
+
+
+def _ele(node: ElementTree.Element) -> float:
+    """Return the height of a node, metres, 0 for one that says none; raises ValueError for what is no number."""
+    return next((float(tag.attrib["v"]) for tag in node.iter("tag") if tag.attrib.get("k") == "ele"), 0.0)
 
 
 def _text(value: Any) -> str:
@@ -136,7 +143,7 @@ def _feature(
             notes.add("nodes that are marked as deleted are left out", place)
             continue
         try:
-            points.append((float(node.attrib["lon"]), float(node.attrib["lat"])))
+            points.append((float(node.attrib["lon"]), float(node.attrib["lat"]), _ele(node)))
         except (KeyError, ValueError) as error:
             raise ValueError(
                 f"node {node.attrib.get('id')} of {name} has no latitude and longitude; a map in local_x and local_y "

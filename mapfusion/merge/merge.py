@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -20,17 +20,16 @@ from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import MapWriter, check_frames, frame_of, read_box, read_map
 from mapfusion.formats.local_plane import LocalPlane, common_plane
-from mapfusion.geometry import simplified_rows
+from mapfusion.geometry import arc_length, simplified_rows
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, ground_within, rings_around
 from mapfusion.line_repair import repaired_rows
 from mapfusion.merge.config import MergeConfig
-from mapfusion.merge.contribution import Contribution, Looks
 from mapfusion.merge.corrections import Correction, solve_corrections
-from mapfusion.merge.lines import fuse_lines
 from mapfusion.merge.report import MapStatus, MergeReport, notes_of_copies, short_names
-from mapfusion.merge.rings import fuse_rings
-from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, cut_line, tiles_of
+from mapfusion.merge.tile_fusion import fuse_tile, named
+from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, tiles_of
+from mapfusion.road_heights import filled, rises
 
 Progress = Callable[[int, int, str], None]
 """Called as ``progress(done, in all, what)``."""
@@ -211,7 +210,7 @@ class _Merge:
         for entry in self.entries:
             if entry.place in apart:
                 for element in self.cache.raw(entry.place):
-                    yield self._counted(_named(element, entry.name))
+                    yield self._counted(named(element, entry.name))
 
     def report(self) -> MergeReport:
         """Return the report, once all elements were taken."""
@@ -277,6 +276,9 @@ class _Merge:
         if len(rows) < 2 or shapely.LineString(points).length < self.config.min_length:
             return
         kept = simplified_rows(points, self.config.simplify_tolerance)
+        heights = filled(values[:, 2], points)
+        if heights is not None:
+            kept = np.union1d(kept, rises(arc_length(points), heights))
         element = MapElement(
             kind=line.kind,
             points=points[kept],
@@ -285,6 +287,7 @@ class _Merge:
             first_seen=line.first_seen,
             last_seen=line.last_seen,
             deviation=np.sqrt(values[kept, 0]),
+            heights=None if heights is None else heights[kept],
         )
         yield element.with_origins(line.origins)
 
@@ -346,50 +349,5 @@ def _align_with(cache: _MapCache, place: int, others: Sequence[int]) -> list[tup
 def _fuse_tile(
     cache: _MapCache, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
 ) -> tuple[list[MergedLine], list[MapElement]]:
-    """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings."""
-    low, high = tile.low - config.margin, tile.high + config.margin
-    loaded = []
-    for place in places:
-        global_map, ground = cache.corrected(place)
-        around = Looks(part for element in global_map for part in _in_box(element, low, high))
-        loaded.append((place, global_map, ground, around))
-    lines: list[MergedLine] = []
-    rings: list[MapElement] = []
-    for kind in ElementKind:
-        contributions = []
-        for place, global_map, ground, looks in loaded:
-            parts = (part for element in global_map.of_kind(kind) for part in _in_box(element, low, high))
-            elements = [_named(part, names[place]) for part in parts]
-            contributions.append(Contribution(place, elements, ground, looks))
-        if kind.is_ring:
-            rings.extend(ring for ring in fuse_rings(contributions, config) if _owns(tile, ring))
-            continue
-        for line in fuse_lines(kind, contributions, config):
-            for points, values in cut_line(line.points, line.values, tile.low, tile.high):
-                lines.append(replace(line, points=points, values=values))
-    return lines, rings
-
-
-def _named(element: MapElement, name: str) -> MapElement:
-    """Return an element that says where it comes from: what it says already, or the map that holds it."""
-    return element.with_origins({source or name: tracks for source, tracks in element.origins.items()})
-
-
-def _in_box(element: MapElement, low: Float, high: Float) -> list[MapElement]:
-    """Return the parts of a line inside a box, or a crossing as a whole if it touches the box."""
-    if (element.points.max(axis=0) < low).any() or (element.points.min(axis=0) >= high).any():
-        return []
-    if element.kind.is_ring:
-        return [element]
-    deviation = element.deviation
-    values = np.zeros((len(element.points), 0)) if deviation is None else deviation[:, None]
-    return [
-        replace(element, points=points, deviation=None if deviation is None else part[:, 0])
-        for points, part in cut_line(element.points, values, low, high)
-    ]
-
-
-def _owns(tile: Tile, ring: MapElement) -> bool:
-    """Whether the middle of a crossing lies in a tile."""
-    middle = (ring.points.min(axis=0) + ring.points.max(axis=0)) / 2
-    return bool((middle >= tile.low).all() and (middle < tile.high).all())
+    """Fuse what the maps have in a tile."""
+    return fuse_tile(tile, [(names[place], place, *cache.corrected(place)) for place in places], config)

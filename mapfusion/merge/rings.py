@@ -13,6 +13,7 @@ from mapfusion.arrays import Float
 from mapfusion.elements import MapElement, united_origins
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
+from mapfusion.road_heights import RoadHeights, filled, mean_heights
 from mapfusion.signed_distance import positive_areas, signed_distance
 
 CELL = 0.25
@@ -106,6 +107,7 @@ def _outline(cluster: _Cluster, config: MergeConfig) -> Float | None:
 
 def _element(cluster: _Cluster, outline: Float, sure: float, config: MergeConfig) -> MapElement:
     weight = sum(float(information(ring, config).mean()) for ring in cluster.rings)
+    heights = filled(mean_heights((RoadHeights.of_elements([ring]) for ring in cluster.rings), outline), outline)
     return MapElement(
         kind=cluster.rings[0].kind,
         points=outline,
@@ -114,4 +116,5 @@ def _element(cluster: _Cluster, outline: Float, sure: float, config: MergeConfig
         first_seen=min(ring.first_seen for ring in cluster.rings),
         last_seen=max(ring.last_seen for ring in cluster.rings),
         deviation=np.full(len(outline), 1.0 / np.sqrt(weight)),
+        heights=heights,
     ).with_origins(united_origins(ring.origins for ring in cluster.rings))

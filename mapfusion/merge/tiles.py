@@ -111,7 +111,8 @@ class MergedLine:
     Attributes:
         kind: divider or boundary.
         points: ``(n, 2)``, metres.
-        values: ``(n, 2)``: variance across the line, m², and log-odds of existence.
+        values: ``(n, 2)``: variance across the line, m², and log-odds of existence; of a cut line ``(n, 3)``: with its
+            height, metres, NaN where it is not known.
         observations: frames that saw it, by source.
         first_seen, last_seen: nanoseconds.
         origins: names of the sources, and the ids of the tracks in them.

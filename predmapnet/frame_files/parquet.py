@@ -17,9 +17,11 @@ track_ids          list of int64          -1 for an element that is not tracked
 polylines          list of list of double x0, y0, x1, y1, ... metres, ego frame
 forecasts          list of list of double the same for the next instant; null without a forecaster
 visible            list of list of double rings around the ground that could be seen, like polylines; null for all
+ground_height      double                 z of the road under the car, metres, ego frame
 =================  =====================  =================================================================
 
-Files without the column ``visible`` are read, too. Rasters (segmentation, history masks) are not stored.
+Files without the columns ``visible`` and ``ground_height`` are read, too. Rasters (segmentation, history masks) are
+not stored.
 """
 
 from __future__ import annotations
@@ -60,6 +62,7 @@ _SCHEMA = pa.schema(
         ("polylines", _LINES),
         ("forecasts", _LINES),
         ("visible", _LINES),
+        ("ground_height", pa.float64()),
     ]
 )
 
@@ -123,6 +126,7 @@ def _row_of(frame: StoredFrame) -> dict[str, Any]:
         "polylines": _flat(frame_map.polylines),
         "forecasts": _flat(frame_map.forecasts),
         "visible": _flat(frame_map.visible),
+        "ground_height": frame_map.ground_height,
     }
 
 
@@ -189,7 +193,7 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
             f"{path} is no per-frame result that this program reads: it has {found} in its metadata, "
             f"version {SCHEMA_VERSION} is expected. Write it with 'predmapnet infer --save-frames'."
         )
-    missing = sorted(set(_SCHEMA.names) - {"visible"} - set(schema.names))
+    missing = sorted(set(_SCHEMA.names) - {"visible", "ground_height"} - set(schema.names))
     if missing:
         raise UserError(f"{path} lacks the columns {', '.join(missing)}; write it again with --save-frames.")
 
@@ -214,6 +218,7 @@ def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:
             polylines=tuple(_points(line) for line in row["polylines"]),
             forecasts=None if forecasts is None else tuple(_points(line) for line in forecasts),
             visible=None if visible is None else tuple(_points(line) for line in visible),
+            ground_height=float(row.get("ground_height", 0.0)),
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{where}: {error}.") from error

@@ -12,6 +12,7 @@ import shapely
 
 from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
 from mapfusion.ground import seen_along
+from mapfusion.road_heights import RoadHeights
 from predmapnet.errors import UserError
 from predmapnet.frame_files.maptr import read_detections
 from predmapnet.frame_files.parquet import read_frames
@@ -114,7 +115,8 @@ def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
             fused.append(frame.frame_map)
     check_left_out(len(ordered), len(fused), integrator.rejections)
     logs = tuple(dict.fromkeys(frame.log for frame in ordered))
-    return Integration(integrator.map(), len(ordered), logs, dict(integrator.rejections), seen_along(fused))
+    global_map = RoadHeights.along(fused).lifted_map(integrator.map())
+    return Integration(global_map, len(ordered), logs, dict(integrator.rejections), seen_along(fused))
 
 
 def _placed(
