@@ -156,9 +156,10 @@ def rises(station: Float, heights: Float) -> Integer:
 
 def _dense(element: MapElement) -> Float:
     """Return samples ``(n, 3)`` along an element with heights."""
+    assert element.heights is not None
     station = arc_length(element.points)
-    at = _stations(station)
-    return np.column_stack([_interpolated(at, station, element.points), np.interp(at, station, element.heights)])
+    table = np.column_stack([element.points, element.heights])
+    return _interpolated(_stations(station), station, table)
 
 
 def _stations(station: Float) -> Float:
@@ -168,4 +169,4 @@ def _stations(station: Float) -> Float:
 
 
 def _interpolated(at: Float, station: Float, points: Float) -> Float:
-    return np.stack([np.interp(at, station, points[:, axis]) for axis in range(2)], axis=1)
+    return np.stack([np.interp(at, station, points[:, axis]) for axis in range(points.shape[1])], axis=1)
