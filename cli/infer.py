@@ -13,12 +13,13 @@ from cli.options import (
     DataRoot,
     Dataset,
     Device,
+    Engine,
     Origin,
     PrecisionOption,
     Threads,
     Weights,
 )
-from predmapnet.machine import NetworkOptions, Precision, use_threads
+from predmapnet.machine import EngineKind, NetworkOptions, Precision, use_threads
 
 
 def infer(
@@ -33,6 +34,7 @@ def infer(
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
+    engine: Engine = EngineKind.TORCH,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
@@ -47,7 +49,7 @@ def infer(
     use_threads(threads)
     from predmapnet.runs.infer import MappingPipeline
 
-    network = NetworkOptions(weights, device, precision, compiled)
+    network = NetworkOptions(weights, device, precision, compiled, engine)
     pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, frame_origin)
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)

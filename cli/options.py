@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from predmapnet.machine import Precision
+from predmapnet.machine import EngineKind, Precision
 
 
 class Scheme(StrEnum):
@@ -38,7 +38,14 @@ OfficialFrames = Annotated[
         help="Argoverse 2: exactly the frames of the published benchmarks, counted across all logs of a split.",
     ),
 ]
-Weights = Annotated[Path | None, typer.Option(help="Checkpoint (.safetensors). Default: the shipped one.")]
+Weights = Annotated[
+    Path | None,
+    typer.Option(help="Checkpoint (.safetensors), or a folder of exported graphs. Default: the shipped checkpoint."),
+]
+Engine = Annotated[
+    EngineKind,
+    typer.Option(help="torch, or onnx: ONNX Runtime (extra 'onnx'; exports the checkpoint first, for a minute)."),
+]
 Device = Annotated[str, typer.Option(help="auto, cpu, cuda or mps.")]
 PrecisionOption = Annotated[
     Precision,

@@ -1,4 +1,4 @@
-"""``predmapnet weights``: import public weights, inspect weights files."""
+"""``predmapnet weights``: import public weights, export graphs, inspect weights files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from predmapnet.weights.inspection import WeightsInfo
     from predmapnet.weights.maptracker_import import ImportReport
 
-weights = typer.Typer(name="weights", help="Import public weights, inspect weights files.", no_args_is_help=True)
+weights = typer.Typer(name="weights", help="Import, export and inspect weights.", no_args_is_help=True)
 
 
 @weights.command("import")
@@ -66,6 +66,37 @@ def import_weights(
         facts |= {"untrained": parts_of(report.fresh), "seed": seed}
     save_checkpoint(out, network, facts)
     _say_import(report, network.config.name, out)
+
+
+@weights.command("export")
+def export_weights(
+    onnx: Annotated[Path, typer.Option(help="Folder of ONNX graphs to make.", metavar="FOLDER")],
+    file: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Checkpoint (.safetensors); the shipped one if none is named.", metavar="[FILE]", show_default=False
+        ),
+    ] = None,
+    rows: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Tracks that a stream can hold at once. Default: 64, or as many as the network has queries."
+        ),
+    ] = None,
+) -> None:
+    """Export the network as two ONNX graphs: images to BEV, and BEV and state to map and next state.
+
+    Map with them (`predmapnet infer --weights FOLDER`), or run them anywhere; docs/onnx.md names inputs and outputs.
+    """
+    from cli.console import err, out
+    from predmapnet.export.onnx_files import export_graphs
+    from predmapnet.weights.checkpoint import load_checkpoint
+
+    checkpoint = load_checkpoint(file)
+    with err.status("Exporting; this takes a minute or two."):
+        graphs = export_graphs(checkpoint, onnx, rows)
+    size = sum(path.stat().st_size for path in onnx.iterdir()) / 1e6
+    out.print(f"{graphs.config.name} with {graphs.rows} tracks written: {onnx} ({size:.0f} MB)", markup=False)
 
 
 @weights.command("inspect")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import re
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,6 +49,26 @@ def write_file(path: Path) -> Iterator[Path]:
     """Write ``path`` as :func:`mapfusion.files.write_whole` does, but raise UserError if that fails."""
     with write_errors_told(path), mapfusion.files.write_whole(path) as temporary:
         yield temporary
+
+
+@contextlib.contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder beside ``path`` that gets its name if the block succeeds, and vanishes if not.
+
+    Raises:
+        UserError: ``path`` exists already, or cannot be written.
+    """
+    if path.exists():
+        raise UserError(f"{path} exists already. Choose another name, or delete it first.")
+    with write_errors_told(path):
+        path.absolute().parent.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(dir=path.absolute().parent, prefix=f".{path.name}.", suffix=".part"))
+        try:
+            yield draft
+            draft.chmod(0o755)
+            draft.rename(path)
+        finally:
+            shutil.rmtree(draft, ignore_errors=True)
 
 
 @contextlib.contextmanager

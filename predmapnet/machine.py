@@ -21,21 +21,30 @@ class Precision(StrEnum):
     BFLOAT16 = "bfloat16"
 
 
+class EngineKind(StrEnum):
+    """What computes the network."""
+
+    TORCH = "torch"
+    ONNX = "onnx"
+
+
 @dataclass(frozen=True)
 class NetworkOptions:
     """The network of a run and how this machine computes with it.
 
     Attributes:
-        weights: a ``.safetensors`` checkpoint; None for the shipped ``lite`` weights.
+        weights: a ``.safetensors`` checkpoint, or a folder of exported graphs; None for the shipped ``lite`` weights.
         device: ``auto`` (a GPU if there is one), or a device by torch's name.
         precision: of the image backbone and the BEV encoder.
         compiled: whether these two are compiled, which delays the first frames.
+        engine: what computes the network; ``onnx`` exports a checkpoint first, a folder of graphs is always its.
     """
 
     weights: Path | None = None
     device: str = "auto"
     precision: Precision = Precision.FLOAT32
     compiled: bool = False
+    engine: EngineKind = EngineKind.TORCH
 
 
 def use_threads(count: int) -> int:

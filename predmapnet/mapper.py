@@ -16,21 +16,15 @@ from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.images import read_image
+from predmapnet.engines import Engine, TorchEngine
 from predmapnet.errors import UserError
-from predmapnet.machine import NetworkOptions, Precision
-from predmapnet.network.calibration import Calibration, calibrate
+from predmapnet.machine import EngineKind, NetworkOptions, Precision
+from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import WindowPixels, normalise_images, stack_windows
-from predmapnet.network.kernels.compilation import compile_features
-from predmapnet.network.kernels.inference import for_inference
-from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, Instances, Selection, StreamState, ViewGeometry
-from predmapnet.network.track_selection import select
+from predmapnet.network.state import FrameInputs, Instances, Selection, StreamState
 from predmapnet.scenes import Frame, Image, ground_in_view
 from predmapnet.weights.checkpoint import load_checkpoint
-
-CALIBRATIONS_KEPT = 8
-"""Calibrations whose geometry is remembered; cameras that never move cost it once."""
 
 
 @dataclass(frozen=True)
@@ -63,27 +57,25 @@ class Mapper:
         facts: about the training, from the weights file (:class:`predmapnet.weights.checkpoint.Checkpoint`).
         precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.kernels.low_precision`).
         compiled: whether these two are compiled.
+        engine: what computes the network.
     """
 
     def __init__(
         self,
-        network: PredMapNet,
+        network: PredMapNet | Engine,
         device: str | torch.device = "cpu",
         weights_sha256: str = "",
         facts: Mapping[str, Any] | None = None,
         precision: Precision = Precision.FLOAT32,
         compiled: bool = False,
     ) -> None:
-        self.network = in_precision(for_inference(network).to(device), precision)
-        self.config: PredMapNetConfig = network.config
+        engine = TorchEngine(network, device, precision, compiled) if isinstance(network, PredMapNet) else network
+        self.engine: Engine = engine
+        self.config: PredMapNetConfig = engine.config
         self.weights_sha256 = weights_sha256
         self.facts: Mapping[str, Any] = dict(facts or {})
         self.precision = precision
         self.compiled = compiled
-        if compiled:
-            compile_features(self.network)
-        self._device = torch.device(device)
-        self._geometries: dict[bytes, ViewGeometry] = {}
 
     @classmethod
     def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
@@ -93,6 +85,11 @@ class Mapper:
             UserError: the weights, the device or a compiler are not there.
         """
         options = options or NetworkOptions()
+        if options.engine is EngineKind.ONNX or (options.weights is not None and options.weights.is_dir()):
+            from predmapnet.export.engine import OnnxEngine
+
+            engine = OnnxEngine.open(options)
+            return cls(engine, engine.device, engine.graphs.sha256, engine.graphs.facts)
         checkpoint = load_checkpoint(options.weights)
         device = choose_device(options.device)
         facts, sha256 = checkpoint.facts, checkpoint.sha256
@@ -156,35 +153,18 @@ class Mapper:
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
-        calibration = calibrate(frame.rig, self.config)
+        device = self.engine.device
         inputs = FrameInputs(
-            images=normalise_images(torch.from_numpy(images.windows)[None].to(self._device), self.config.image),
-            camera_valid=torch.from_numpy(images.valid)[None].to(self._device),
-            ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(self._device),
-            calibration=calibration.to(self._device),
+            images=normalise_images(torch.from_numpy(images.windows)[None].to(device), self.config.image),
+            camera_valid=torch.from_numpy(images.valid)[None].to(device),
+            ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(device),
+            calibration=calibrate(frame.rig, self.config).to(device),
         )
-        if state is None:
-            state = self.network.initial_state(1)
-        outputs = self.network(inputs, state, self._geometry(calibration))
-        selection = select(outputs, state, self.config)
-        state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
-        frame_map = to_frame_map(
-            selection, state, outputs.segmentation, self.config, frame.timestamp, frame.ego_to_global
-        )
+        selection, state, segmentation = self.engine.step(inputs, state)
+        frame_map = to_frame_map(selection, state, segmentation, self.config, frame.timestamp, frame.ego_to_global)
         working = (camera for camera, valid in zip(frame.rig, images.valid, strict=True) if valid)
         road = float(np.median([camera.ground_height for camera in frame.rig]))
         return replace(frame_map, visible=ground_in_view(working, self.roi), ground_height=road), state
-
-    def _geometry(self, calibration: Calibration) -> ViewGeometry:
-        """Return the geometry of a calibration, from the few that were used last."""
-        key = calibration.fingerprint()
-        geometry = self._geometries.pop(key, None)
-        if geometry is None:
-            geometry = self.network.view_geometry(calibration.to(self._device))
-        self._geometries[key] = geometry
-        if len(self._geometries) > CALIBRATIONS_KEPT:
-            del self._geometries[next(iter(self._geometries))]
-        return geometry
 
 
 def choose_device(name: str) -> torch.device:

@@ -108,5 +108,5 @@ def extend_history(
     padded = shifted.gather(2, slots[..., None, None].expand_as(shifted))
     return (
         torch.where(matched[..., None, None, None], padded, fresh),
-        torch.where(matched[..., None], shifted_valid, fresh_valid),
+        matched[..., None] & shifted_valid | ~matched[..., None] & fresh_valid,  # ONNX chooses no booleans.
     )

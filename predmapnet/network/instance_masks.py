@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.network.kernels.tracing import is_traced
 from predmapnet.network.layers import Perceptron, Pointwise
 
 
@@ -50,6 +51,21 @@ def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float
         ``(B, R, rows * columns) bool``.
     """
     if mask_logits.shape[-2:] != size:
-        mask_logits = F.adaptive_max_pool2d(mask_logits, size)
+        mask_logits = largest_in_cells(mask_logits, size)
     inside = mask_logits.flatten(2).sigmoid() > threshold
     return inside | ~inside.any(dim=-1, keepdim=True)
+
+
+def largest_in_cells(maps: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the largest value ``(B, R, rows, columns)`` of maps ``(B, R, h, w)`` in each cell of a coarser grid."""
+    if not is_traced():
+        return F.adaptive_max_pool2d(maps, size)
+    for axis, cells in zip((-2, -1), size, strict=True):  # ONNX pools evenly divided maps only.
+        length = maps.shape[axis]
+        cell = torch.arange(cells)
+        first, last = cell * length // cells, -(-(cell + 1) * length // cells) - 1
+        pooled = maps.index_select(axis, first)
+        for step in range(1, -(-length // cells) + 1):
+            pooled = torch.maximum(pooled, maps.index_select(axis, (first + step).minimum(last)))
+        maps = pooled
+    return maps

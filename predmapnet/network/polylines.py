@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from predmapnet.network.kernels.tracing import is_traced
+
 
 def resample_polylines(points: Tensor, count: int, start: Tensor | None = None, stop: Tensor | None = None) -> Tensor:
     """Place points at equal distances along each line.
@@ -23,11 +25,18 @@ def resample_polylines(points: Tensor, count: int, start: Tensor | None = None, 
     stop = stations[..., -1] if stop is None else stop
     fractions = torch.linspace(0.0, 1.0, count, device=points.device, dtype=points.dtype)
     wanted = start[..., None] + (stop - start)[..., None] * fractions
-    right = torch.searchsorted(stations.contiguous(), wanted.contiguous()).clamp(1, stations.shape[-1] - 1)
+    right = _first_not_below(stations, wanted).clamp(1, stations.shape[-1] - 1)
     left_station, right_station = stations.gather(-1, right - 1), stations.gather(-1, right)
     share = ((wanted - left_station) / (right_station - left_station).clamp(min=1e-9)).clamp(0.0, 1.0)[..., None]
     corners = right[..., None].expand(*right.shape, 2)
     return points.gather(-2, corners - 1) * (1 - share) + points.gather(-2, corners) * share
+
+
+def _first_not_below(stations: Tensor, wanted: Tensor) -> Tensor:
+    """Return the index of the first of the rising ``stations (..., P)`` that is not below each ``wanted (..., K)``."""
+    if is_traced():  # ONNX knows no searchsorted.
+        return (stations[..., None, :] < wanted[..., None]).sum(dim=-1)
+    return torch.searchsorted(stations.contiguous(), wanted.contiguous())
 
 
 def clip_polylines(points: Tensor, is_ring: Tensor, roi_size: Tensor) -> tuple[Tensor, Tensor]:

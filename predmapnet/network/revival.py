@@ -18,6 +18,7 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PredMapNetConfig, RevivalConfig
 from predmapnet.network.ego_motion import move_points, relative_motion, warp_bev
 from predmapnet.network.former_tracks import FormerTracks, match_tracks
+from predmapnet.network.kernels.tracing import is_traced, stable_order
 from predmapnet.network.state import Instances, LostTracks, StreamState
 
 CONTESTS = 3
@@ -52,7 +53,7 @@ def revive(
     comparable = (lost.labels[:, :, None] == instances.labels[:, None]) & lost.valid[:, :, None] & newborn[:, None]
     # In most frames there is no such pair. The selection has just waited for the device, so asking costs little.
     candidates = comparable.nonzero()
-    if len(candidates) == 0:
+    if not is_traced() and len(candidates) == 0:
         return instances, lost
     distances = torch.full_like(comparable, torch.inf, dtype=instances.points.dtype)
     distances[candidates.unbind(dim=1)] = _distances(candidates, lost, instances.points, ego_to_global, config.roi)
@@ -79,7 +80,7 @@ def with_returned_tracks(
     """
     row, found = match_tracks(instances, lost)
     revived = found & ~memory.matched
-    if not revived.any():
+    if not is_traced() and not revived.any():
         return memory
     stream = torch.arange(len(row), device=row.device)[:, None]
     then = lost.ego_to_global[stream, row]
@@ -127,7 +128,7 @@ def _lost_tracks(instances: Instances, state: StreamState, repeats: Tensor, rule
     gone = _shares_id(state.lost.track_ids, tracks.track_ids, repeats)
     before = replace(state.lost, missing=missing, valid=state.lost.valid & (missing <= rules.frames) & ~gone)
     valid = torch.cat([now.valid, before.valid], dim=1)
-    order = (~valid).long().argsort(dim=1, stable=True)[:, : rules.capacity]
+    order = stable_order((~valid).long())[:, : rules.capacity]
     stream = torch.arange(len(order), device=order.device)[:, None]
     rows = {
         name: torch.cat([value, getattr(before, name)], dim=1)[stream, order]

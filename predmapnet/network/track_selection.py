@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PredMapNetConfig, TrackingConfig
+from predmapnet.network.kernels.tracing import rows_needed, stable_order
 from predmapnet.network.polylines import chamfer_distances, resample_polylines
 from predmapnet.network.revival import revive
 from predmapnet.network.state import FrameOutputs, Instances, Selection, StreamState
@@ -60,13 +61,14 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
         track_ids=torch.cat([rows.track_ids, new_ids], dim=1),
         misses=torch.cat([misses, torch.zeros_like(new_ids)], dim=1),
         scores=torch.cat([scores, detection_scores], dim=1),
+        most=tracks,
     )
     others, reported, other_scores = detection_rows, free & ~born, detection_scores
     if not rules.merge:
         ended = rows.valid[:, :tracks] & ~alive & (scores > rules.report_threshold)
         others, reported, other_scores = rows.rows, torch.cat([ended, reported], dim=1), rows.scores
     no_id, no_misses = torch.full_like(others, -1), torch.zeros_like(others)
-    detections = _compact(outputs, others, reported, no_id, no_misses, other_scores)
+    detections = _compact(outputs, others, reported, no_id, no_misses, other_scores, most=others.shape[1])
     if state is None or not config.revival.enabled:
         return Selection(instances, detections)
     instances, lost = revive(instances, state, repeats, outputs.ego_to_global, config)
@@ -111,10 +113,10 @@ def _candidates(outputs: FrameOutputs, state: StreamState | None, rules: Trackin
     scores, labels = logits.sigmoid().max(dim=-1)
     detections = scores[:, tracks:]
     rank = -detections if rules.merge else (detections <= rules.report_threshold).int()
-    order = rank.argsort(dim=1, stable=True)
+    order = stable_order(rank)
     ranked = detections.gather(1, order)
     # At least one column, so that nothing below has to think of none.
-    count = max(1, int((ranked > rules.report_threshold).sum(dim=1).max()))
+    count = max(1, rows_needed(ranked > rules.report_threshold, ranked.shape[1]))
     track_rows = torch.arange(tracks, device=scores.device).expand(len(scores), tracks)
     rows = torch.cat([track_rows, order[:, :count] + tracks], dim=1)
     enough = ranked[:, :count] > rules.report_threshold
@@ -178,11 +180,15 @@ def _take_up(distances: Tensor, rows: _Rows, alive: Tensor, rules: TrackingConfi
 
 
 def _compact(
-    outputs: FrameOutputs, rows: Tensor, valid: Tensor, track_ids: Tensor, misses: Tensor, scores: Tensor
+    outputs: FrameOutputs, rows: Tensor, valid: Tensor, track_ids: Tensor, misses: Tensor, scores: Tensor, most: int
 ) -> Instances:
-    """Move valid rows to the front, in their order, and cut the padding that no stream needs."""
-    count = int(valid.sum(dim=1).max())
-    order = (~valid).long().argsort(dim=1, stable=True)[:, :count]
+    """Move valid rows to the front, in their order, and cut the padding that no stream needs.
+
+    Args:
+        most: rows of the result in a traced graph, where their number cannot depend on data.
+    """
+    count = rows_needed(valid, most)
+    order = stable_order((~valid).long())[:, :count]
     rows, valid, track_ids, misses, scores = (
         column.gather(1, order) for column in (rows, valid, track_ids, misses, scores)
     )

@@ -244,6 +244,7 @@ class MappingPipeline:
             "weights_sha256": self.mapper.weights_sha256,
             "precision": self.mapper.precision.value,
             "compiled": self.mapper.compiled,
+            "engine": str(self.mapper.engine.kind),
             "seed": SEED,
         }
         if self.note:

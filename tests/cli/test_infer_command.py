@@ -58,6 +58,7 @@ def test_a_scene_becomes_a_map_a_recording_and_a_table_of_frames(infer, tmp_path
     assert len(provenance["weights_sha256"]) == 64
     assert provenance["precision"] == "float32"
     assert provenance["compiled"] is False
+    assert provenance["engine"] == "torch"
     assert str(tmp_path) not in json.dumps(provenance)
     assert pq.read_table(tmp_path / "f.parquet").num_rows == 3
     entities = {chunk.entity_path for chunk in RrdReader(tmp_path / "r.rrd").stream()}

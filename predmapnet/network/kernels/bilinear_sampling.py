@@ -11,6 +11,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from predmapnet.network.kernels.tracing import is_traced
+
 
 def bilinear_corners(x: Tensor, y: Tensor, width: Tensor | int, height: Tensor | int) -> tuple[Tensor, Tensor]:
     """Find the four pixels around each position, and their shares.
@@ -49,10 +51,15 @@ def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
 
     Args:
         table: ``(rows, C)``.
-        indices: ``(results, n) int``.
+        indices: ``(results, n) int``, n a multiple of 4: the corners of each sample.
         weights: ``(results, n)``.
 
     Returns:
         ``(results, C)``.
     """
+    if is_traced():  # ONNX has no bags. The corners of a sample one after the other need a quarter of the memory.
+        corners = zip(
+            indices.long().unflatten(1, (-1, 4)).unbind(-1), weights.unflatten(1, (-1, 4)).unbind(-1), strict=True
+        )
+        return torch.stack([(table[index] * weight[..., None]).sum(dim=1) for index, weight in corners]).sum(dim=0)
     return F.embedding_bag(indices, table.to(weights.dtype), per_sample_weights=weights, mode="sum")

@@ -6,6 +6,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from predmapnet.network.kernels.tracing import is_traced
+
 MANY_ROWS = 512
 """From here on a convolution's greater overhead pays."""
 
@@ -30,6 +32,8 @@ def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor
         ``(..., C_out)``.
     """
     tokens = tokens.to(weight.dtype)
+    if is_traced():
+        return F.linear(tokens, weight, bias)
     rows = tokens.numel() // weight.shape[1]
     batch = _divisor(rows) if rows >= MANY_ROWS and tokens.device.type == "cpu" else None
     if batch is None or not ONEDNN:

@@ -8,6 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from predmapnet.network.kernels.tracing import stable_order
+
 
 def select_strided(
     travelled: Tensor, valid: Tensor, distances: Sequence[float], fallback: Literal["latest", "nearest"]
@@ -33,7 +35,9 @@ def select_strided(
     latest = latest.expand(*travelled.shape[:-1], slots)
     if travelled.shape[-1] <= len(distances):
         return latest, valid
-    near, order = travelled.masked_fill(~valid, torch.inf).sort(dim=-1, stable=True)
+    travelled = travelled.masked_fill(~valid, torch.inf)
+    order = stable_order(travelled)
+    near = travelled.gather(-1, order)
     entries = valid.sum(dim=-1)
     left, picks = entries, []
     for distance in reversed(distances):

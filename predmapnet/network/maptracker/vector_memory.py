@@ -11,6 +11,7 @@ from torch import Tensor
 
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_pose
+from predmapnet.network.kernels.tracing import stable_order
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
 from predmapnet.network.maptracker.strided_selection import select_strided
 from predmapnet.network.state import VectorMemory
@@ -64,7 +65,7 @@ def recall_queries(
     current = ego_to_global.to(memory.poses.dtype)[:, None, None]
     travelled = (memory.poses[..., :2, 3] - current[..., :2, 3]).norm(dim=-1)
     slots, valid = select_strided(travelled, memory.valid, distances, fallback="nearest")
-    first = (~valid).int().argsort(dim=-1, stable=True)
+    first = stable_order((~valid).int())
     slots, valid = slots.gather(-1, first), valid.gather(-1, first)
 
     poses = memory.poses.take_along_dim(slots[..., None, None], dim=2)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.network.calibration import Calibration
+from predmapnet.network.kernels.tracing import is_traced
 from predmapnet.network.layers import cell_centres
 
 NEAREST_DEPTH = 0.1
@@ -42,6 +43,13 @@ class SparseRows:
 
     def multiply(self, table: Tensor) -> Tensor:
         """Multiply with ``(columns, C)``; an embedding bag is several times faster than a CSR product on a CPU."""
+        if is_traced():  # ONNX has no bags.
+            begins = self.starts.new_zeros(self.columns.shape[0] + 1, dtype=torch.int64)
+            rows = (
+                begins.index_add(0, self.starts.long(), torch.ones_like(self.starts, dtype=torch.int64)).cumsum(0) - 1
+            )
+            entries = table[self.columns.long()] * self.weights[:, None]
+            return table.new_zeros(len(self.starts), table.shape[1]).index_add(0, rows[:-1], entries)
         return F.embedding_bag(self.columns, table, self.starts, per_sample_weights=self.weights, mode="sum")
 
 
@@ -148,6 +156,10 @@ class _SparseProduct(torch.autograd.Function):
         return ctx.lookup.scatter.multiply(gradient.contiguous()), None
 
 
+def _differentiable_product(table: Tensor, lookup: GroundLookup) -> Tensor:
+    return _SparseProduct.apply(table, lookup)  # type: ignore[no-untyped-call]
+
+
 def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> Tensor:
     """Look image features up at every point of the ground: the mean over the cameras that see it and are valid.
 
@@ -161,6 +173,6 @@ def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> T
     """
     features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
     table = features.permute(0, 1, 3, 4, 2).reshape(-1, features.shape[2]).to(lookup.gather.weights.dtype)
-    summed = _SparseProduct.apply(table, lookup)  # type: ignore[no-untyped-call]
+    summed = lookup.gather.multiply(table) if not torch.is_grad_enabled() else _differentiable_product(table, lookup)
     cameras = lookup.visible.to(summed.dtype) @ camera_valid.to(summed.dtype)[..., None]
     return summed.unflatten(0, cameras.shape[:2]) / cameras.clamp(min=1.0)

@@ -1,0 +1,83 @@
+"""What computes the network for a :class:`~predmapnet.mapper.Mapper`: torch here, exported graphs elsewhere."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from predmapnet.config import PredMapNetConfig
+from predmapnet.machine import EngineKind, Precision
+from predmapnet.network.calibration import Calibration
+from predmapnet.network.kernels.compilation import compile_features
+from predmapnet.network.kernels.inference import for_inference
+from predmapnet.network.kernels.low_precision import in_precision
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import FrameInputs, Selection, StreamState, ViewGeometry
+from predmapnet.network.track_selection import select
+
+CALIBRATIONS_KEPT = 8
+"""Calibrations whose geometry is remembered; cameras that never move cost it once."""
+
+EngineStep = tuple[Selection, StreamState, Tensor]
+"""What inference makes of a frame, the state of the next one, and segmentation logits ``(1, 3, H_s, W_s)``."""
+
+
+class Engine(Protocol):
+    """Computes one instant of one stream.
+
+    Attributes:
+        config: of the network.
+        device: where inputs are wanted.
+        kind: its name in files.
+    """
+
+    kind: EngineKind
+    config: PredMapNetConfig
+    device: torch.device
+
+    def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
+        """Map one frame; a state of None begins a stream, and the one given is not changed."""
+        ...
+
+
+class TorchEngine:
+    """The network itself, made ready for inference.
+
+    Args:
+        network: is copied.
+        device: where it computes.
+        precision: of the image backbone and the BEV encoder.
+        compiled: whether these two are compiled.
+    """
+
+    kind = EngineKind.TORCH
+
+    def __init__(self, network: PredMapNet, device: str | torch.device, precision: Precision, compiled: bool) -> None:
+        self.network = in_precision(for_inference(network).to(device), precision)
+        self.config = network.config
+        self.device = torch.device(device)
+        if compiled:
+            compile_features(self.network)
+        self._geometries: dict[bytes, ViewGeometry] = {}
+
+    def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
+        """Map one frame, as :class:`Engine` says."""
+        if state is None:
+            state = self.network.initial_state(1)
+        outputs = self.network(inputs, state, self._geometry(inputs.calibration))
+        selection = select(outputs, state, self.config)
+        state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
+        return selection, state, outputs.segmentation
+
+    def _geometry(self, calibration: Calibration) -> ViewGeometry:
+        """Return the geometry of a calibration, from the few that were used last."""
+        key = calibration.fingerprint()
+        geometry = self._geometries.pop(key, None)
+        if geometry is None:
+            geometry = self.network.view_geometry(calibration)
+        self._geometries[key] = geometry
+        if len(self._geometries) > CALIBRATIONS_KEPT:
+            del self._geometries[next(iter(self._geometries))]
+        return geometry
