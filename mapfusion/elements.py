@@ -16,6 +16,10 @@ Origins: TypeAlias = Mapping[str, tuple[int, ...]]
 """Ids of tracks by name of the drive or map that they belong to."""
 
 
+PAINTS = ("solid", "dashed")
+"""What is known of the paint of a divider."""
+
+
 class ElementKind(IntEnum):
     """Kind of a map element; the numbers are the class ids of the nuScenes and Argoverse 2 benchmarks."""
 
@@ -145,6 +149,8 @@ class MapElement:
         sources: names of the drives, or of the maps if those do not name any, that it comes from, ascending.
         source_track_ids: ids of the tracks in each of the sources, in their order.
         heights: ``(n,) float64``, metres, of the road at each vertex, z of the global frame, if known.
+        name: the same from run to run; empty until a file gives it one (:mod:`mapfusion.formats.identities`).
+        paint: of a divider, ``solid`` or ``dashed``; empty where it is not known.
     """
 
     kind: ElementKind
@@ -158,6 +164,8 @@ class MapElement:
     sources: tuple[str, ...] = ()
     source_track_ids: tuple[tuple[int, ...], ...] = ()
     heights: Float | None = None
+    name: str = ""
+    paint: str = ""
 
     @property
     def length(self) -> float:

@@ -8,6 +8,9 @@ import numpy as np
 
 from mapfusion.arrays import Float
 
+LOCAL_FRAME = "local_frame"
+"""Key of the provenance that names a frame whose place on Earth is not known."""
+
 FARTHEST = 100_000.0
 """Farthest that a point may lie from the origin of a local frame, metres: beyond, its lengths are not true."""
 

@@ -15,9 +15,10 @@ from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
 from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
-from mapfusion.formats.lanelet2 import read_lanelet, write_lanelet
+from mapfusion.formats.lanelet2 import write_lanelet
+from mapfusion.formats.lanelet2_reader import read_lanelet
 from mapfusion.formats.local_plane import LocalPlane, common_plane
-from mapfusion.georeference import Georeference, InvertibleGeoreference
+from mapfusion.georeference import LOCAL_FRAME, Georeference, InvertibleGeoreference
 
 SUFFIXES = {
     ".geojson": "GeoJSON",
@@ -27,9 +28,6 @@ SUFFIXES = {
     ".osm": "Lanelet2",
 }
 """Endings of the files that hold maps, and the format of each."""
-
-LOCAL_FRAME = "local_frame"
-"""Key of the provenance that names a frame whose place on Earth is not known."""
 
 _WRITERS = {"GeoPackage": write_geodatabase, "FlatGeobuf": write_geodatabase, "Lanelet2": write_lanelet}
 _READERS = {"GeoPackage": read_geodatabase, "FlatGeobuf": read_geodatabase, "Lanelet2": read_lanelet}

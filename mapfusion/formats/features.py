@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from mapfusion.arrays import Float
-from mapfusion.elements import ElementKind, GlobalMap, MapElement
+from mapfusion.elements import PAINTS, ElementKind, GlobalMap, MapElement
 from mapfusion.formats.foreign_shapes import DrawnPath, paths_of
 from mapfusion.formats.foreign_values import list_of, number_of, time_of, whole_numbers_of
+from mapfusion.formats.identities import digest_name
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
@@ -60,6 +61,8 @@ class _Element:
     track_ids: tuple[int, ...]
     sources: tuple[str, ...]
     source_track_ids: tuple[tuple[int, ...], ...]
+    name: str
+    paint: str
 
 
 def map_of(
@@ -127,6 +130,8 @@ def _elements(place: int, feature: Feature, notes: ReadingNotes) -> list[_Elemen
             _told(time_of, properties, "last_seen"),
             _told(whole_numbers_of, properties, "track_ids"),
             *_sources(properties, place, notes),
+            _name(feature.content, kind, path),
+            _paint(properties.get("paint"), place, notes),
         )
         for path in paths_of(geometry, kind.is_ring, place, notes)
     ]
@@ -199,6 +204,21 @@ def _numbers(
     return None
 
 
+def _name(content: Mapping[str, Any], kind: ElementKind, path: DrawnPath) -> str:
+    """Return the id of a feature, or one made of its first position."""
+    given = content.get("id")
+    given = content["properties"].get("id") if given is None and content.get("properties") else given
+    return str(given) if given not in (None, "") else digest_name(kind.label, path.positions[0].round(6).tolist())
+
+
+def _paint(value: Any, place: int, notes: ReadingNotes) -> str:
+    paint = "" if value is None else str(value).strip().lower()
+    if paint in ("", "unknown", *PAINTS):
+        return paint.removeprefix("unknown")
+    notes.add(f"a paint that is none of {', '.join(PAINTS)}: left out", place)
+    return ""
+
+
 def _sources(
     properties: Mapping[str, Any], place: int, notes: ReadingNotes
 ) -> tuple[tuple[str, ...], tuple[tuple[int, ...], ...]]:
@@ -239,6 +259,8 @@ def _completed(found: list[_Element], georeference: InvertibleGeoreference, note
                 sources=element.sources,
                 source_track_ids=element.source_track_ids,
                 heights=element.heights,
+                name=element.name,
+                paint=element.paint,
             )
         )
     return elements

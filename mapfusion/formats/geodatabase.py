@@ -24,6 +24,7 @@ from mapfusion.files import write_whole
 from mapfusion.formats.features import HEIGHTS, Feature, map_of
 from mapfusion.formats.foreign_values import number_of
 from mapfusion.formats.geojson import feature_of, origin_of
+from mapfusion.formats.identities import all_named
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import Georeference, InvertibleGeoreference
@@ -46,7 +47,7 @@ def write_geodatabase(
     """
     import pyogrio.errors
 
-    features = [feature_of(element, georeference) for element in global_map]
+    features = [feature_of(element, georeference) for element in all_named(global_map)]
     origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     rows = list(enumerate(features))
     with write_whole(path) as temporary, _plain_folder(temporary) as plain:
@@ -113,6 +114,7 @@ def _write_layer(
 
     properties = [feature["properties"] for _, feature in rows]
     columns: dict[str, Any] = {"number": np.array([number for number, _ in rows], dtype=np.int64)}
+    columns["id"] = np.array([feature["id"] for _, feature in rows], dtype=object)
     for name, kind in (
         ("kind", object),
         ("confidence", np.float64),
@@ -122,6 +124,7 @@ def _write_layer(
         ("length_m", np.float64),
     ):
         columns[name] = np.array([row[name] for row in properties], dtype=kind)
+    columns["paint"] = np.array([row.get("paint") for row in properties], dtype=object)
     for name in LISTS:
         texts = [json.dumps(row[name]) if name in row else None for row in properties]
         columns[name] = np.array(texts, dtype=object)

@@ -19,6 +19,7 @@ from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.files import write_whole
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.foreign_values import format_timestamp
+from mapfusion.formats.identities import ElementNames
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import Georeference, InvertibleGeoreference
@@ -72,6 +73,7 @@ class GeoJsonWriter:
         self._georeference = georeference
         self._provenance = provenance
         self._count = 0
+        self._names = ElementNames()
         self._low = np.full(3, np.inf)
         self._high = np.full(3, -np.inf)
 
@@ -89,7 +91,7 @@ class GeoJsonWriter:
 
     def write(self, element: MapElement) -> None:
         """Append one element; raises ValueError for one that does not lie on the globe."""
-        feature = feature_of(element, self._georeference)
+        feature = feature_of(self._names.named(element), self._georeference)
         points = _positions(feature)
         axes = points.shape[1]
         self._low[:axes] = np.minimum(self._low[:axes], points.min(axis=0))
@@ -191,7 +193,10 @@ def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any
         properties["sources"] = list(element.sources)
         if element.source_track_ids:
             properties["source_track_ids"] = [list(tracks) for tracks in element.source_track_ids]
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+    if element.paint:
+        properties["paint"] = element.paint
+    named = {"id": element.name} if element.name else {}
+    return {"type": "Feature", **named, "geometry": geometry, "properties": properties}
 
 
 def _positions(feature: Mapping[str, Any]) -> Float:

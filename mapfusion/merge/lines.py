@@ -17,6 +17,7 @@ import numpy as np
 from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.chains import LineEnd, chain_lines
 from mapfusion.elements import ElementKind, MapElement, united_origins
+from mapfusion.formats.identities import element_name
 from mapfusion.geometry import arc_length, tangents
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
@@ -146,6 +147,8 @@ def _contribute(references: _References, kind: ElementKind, contribution: Contri
                 element.first_seen,
                 element.last_seen,
                 element.origins,
+                element_name(element),
+                element.paint,
             )
             base = len(references.points)
             line = references.append(samples.points[take], worth[take], float(sure[rows.start]), evidence)
@@ -190,6 +193,7 @@ def _visited(
         known.first_seen = min(known.first_seen, element.first_seen)
         known.last_seen = max(known.last_seen, element.last_seen)
         known.origins = united_origins([known.origins, element.origins])
+        known.paint = known.paint or element.paint
     return nodes
 
 

@@ -288,6 +288,8 @@ class _Merge:
             last_seen=line.last_seen,
             deviation=np.sqrt(values[kept, 0]),
             heights=None if heights is None else heights[kept],
+            name=line.name,
+            paint=line.paint,
         )
         yield element.with_origins(line.origins)
 

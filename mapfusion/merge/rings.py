@@ -11,6 +11,7 @@ from scipy.special import expit
 
 from mapfusion.arrays import Float
 from mapfusion.elements import MapElement, united_origins
+from mapfusion.formats.identities import element_name
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Contribution, certainty, doubt, information
 from mapfusion.road_heights import RoadHeights, filled, mean_heights
@@ -117,4 +118,5 @@ def _element(cluster: _Cluster, outline: Float, sure: float, config: MergeConfig
         last_seen=max(ring.last_seen for ring in cluster.rings),
         deviation=np.full(len(outline), 1.0 / np.sqrt(weight)),
         heights=heights,
+        name=element_name(cluster.rings[0]),
     ).with_origins(united_origins(ring.origins for ring in cluster.rings))

@@ -116,6 +116,8 @@ class MergedLine:
         observations: frames that saw it, by source.
         first_seen, last_seen: nanoseconds.
         origins: names of the sources, and the ids of the tracks in them.
+        name: of the element that it follows.
+        paint: as of that element, or of the first one that knows it.
     """
 
     kind: ElementKind
@@ -125,6 +127,8 @@ class MergedLine:
     first_seen: int
     last_seen: int
     origins: Origins = field(default_factory=dict)
+    name: str = ""
+    paint: str = ""
 
     def reversed(self) -> MergedLine:
         """Return it run the other way."""
@@ -150,7 +154,8 @@ class MergedLine:
         for source, count in other.observations.items():
             counts[source] = max(counts.get(source, 0), count)
         first, last = min(self.first_seen, other.first_seen), max(self.last_seen, other.last_seen)
-        return MergedLine(self.kind, points, values, counts, first, last, united_origins([self.origins, other.origins]))
+        origins, paint = united_origins([self.origins, other.origins]), self.paint or other.paint
+        return MergedLine(self.kind, points, values, counts, first, last, origins, self.name or other.name, paint)
 
 
 class Stitcher:

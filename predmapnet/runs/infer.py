@@ -15,9 +15,9 @@ import torch
 
 import predmapnet
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
-from mapfusion.formats.by_suffix import LOCAL_FRAME, write_map
+from mapfusion.formats.by_suffix import write_map
 from mapfusion.formats.local_plane import LocalPlane
-from mapfusion.georeference import Georeference
+from mapfusion.georeference import LOCAL_FRAME, Georeference
 from mapfusion.ground import observed_rings
 from predmapnet.datasets.georeference import LocalFrame, local_frame
 from predmapnet.demo_world.source import DEMO
