@@ -180,6 +180,11 @@ class MapElement:
         tracks = self.source_track_ids or ((),) * len(self.sources)
         return dict(zip(self.sources, tracks, strict=True))
 
+    def with_vertices(self, rows: Integer) -> MapElement:
+        """Return it with some of its vertices, or all in another order, by their rows."""
+        deviation, heights = (None if values is None else values[rows] for values in (self.deviation, self.heights))
+        return replace(self, points=self.points[rows], deviation=deviation, heights=heights)
+
     def with_origins(self, origins: Origins) -> MapElement:
         """Return it with other sources and tracks."""
         named = sorted(set(origins) - {""})

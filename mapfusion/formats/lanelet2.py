@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -156,9 +155,7 @@ def with_right_side_first(element: MapElement) -> tuple[MapElement, int]:
     corner = (last - first) % len(order)
     order = np.roll(order, -(first + 1))
     rows = np.append(order, order[0])
-    values = {name: getattr(element, name) for name in ("points", "deviation", "heights")}
-    turned = {name: None if value is None else value[rows] for name, value in values.items()}
-    return replace(element, **turned), corner
+    return element.with_vertices(rows), corner
 
 
 def _long_axis(ring: Float) -> Float:

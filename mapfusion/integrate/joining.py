@@ -152,8 +152,7 @@ def joined_along(elements: Sequence[MapElement], links: Sequence[Link]) -> list[
 
 
 def _reversed(element: MapElement) -> MapElement:
-    deviation = element.deviation
-    return replace(element, points=element.points[::-1], deviation=None if deviation is None else deviation[::-1])
+    return element.with_vertices(np.arange(len(element.points))[::-1])
 
 
 def _closed(element: MapElement) -> MapElement:

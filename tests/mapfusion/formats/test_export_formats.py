@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,9 +65,7 @@ def turned_like(ring: MapElement, other: MapElement) -> MapElement:
         rows = rows[::-1]
     distance = np.linalg.norm(ring.points[rows] - other.points[0], axis=1)
     rows = np.roll(rows, -int(np.argmin(distance)))
-    rows = np.append(rows, rows[0])
-    values = {name: getattr(ring, name) for name in ("points", "deviation", "heights")}
-    return replace(ring, **{name: None if value is None else value[rows] for name, value in values.items()})
+    return ring.with_vertices(np.append(rows, rows[0]))
 
 
 def assert_same(one: GlobalMap, two: GlobalMap, tolerance: float = 1e-4) -> None:
