@@ -15,6 +15,7 @@ from cli.options import (
     Device,
     Origin,
     PrecisionOption,
+    Rate,
     Scheme,
     SplitScheme,
     Weights,
@@ -37,6 +38,7 @@ def batch(
     ] = False,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    rate: Rate = None,
     split_scheme: SplitScheme = Scheme.OLD,
     origin: Origin = None,
     weights: Weights = None,
@@ -53,13 +55,14 @@ def batch(
     from cli.console import err, progress_display, say_outcomes
     from predmapnet.datasets.georeference import given_origin
     from predmapnet.runs.batch import BatchJournal, BatchSettings, choose_scenes, map_scenes, prepare_folder
-    from predmapnet.sources import open_source
+    from predmapnet.sources import folder_named, open_source
     from predmapnet.weights.files import weights_hash
 
     names = list(scenes or [])
     if len(names) == 1 and Path(names[0]).is_dir():
-        data_root, names = Path(names[0]), []
-    source, sentence = open_source(dataset, data_root, split_scheme.value)
+        dataset, data_root = folder_named(names[0], dataset) or (dataset, Path(names[0]))
+        names = []
+    source, sentence = open_source(dataset, data_root, split_scheme.value, rate=rate)
     err.print(sentence, markup=False)
     chosen = choose_scenes(source, names, split)
     prepare_folder(out)
@@ -72,6 +75,7 @@ def batch(
         save_frames,
         threads=max(1, available_cores() // jobs),
         origin=None if origin is None else given_origin(origin),
+        rate=rate,
     )
     journal = BatchJournal(out)
     with progress_display() as display:

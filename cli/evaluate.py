@@ -18,6 +18,7 @@ from cli.options import (
     Device,
     OfficialFrames,
     PrecisionOption,
+    Rate,
     Scheme,
     SplitScheme,
     Weights,
@@ -55,7 +56,7 @@ def evaluate(
         Path | None,
         typer.Argument(
             help="Folder of `predmapnet batch --save-frames`, per-frame results (.parquet) or a submission (.json). "
-            "Without it, the scenes are mapped first.",
+            "Without it, or with the folder of a log, the scenes are mapped first.",
             show_default=False,
         ),
     ] = None,
@@ -82,6 +83,7 @@ def evaluate(
     ] = Protocol.ANCHORED,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    rate: Rate = None,
     split_scheme: SplitScheme = Scheme.OLD,
     official_frames: OfficialFrames = False,
     no_truth_cache: Annotated[
@@ -95,7 +97,10 @@ def evaluate(
     """Measure per-frame maps and maps of whole drives with the metrics of the field."""
     from cli.console import err, out, progress_display, say_warning
     from predmapnet.files import check_output
+    from predmapnet.sources import folder_named
 
+    if results is not None and (folder := folder_named(str(results), None)) is not None:
+        results, (dataset, data_root) = None, folder
     for path in (json_file, report):
         if path is not None:
             check_output(path)
@@ -113,6 +118,7 @@ def evaluate(
         data_root=data_root,
         split_scheme=split_scheme.value,
         official_frames=official_frames,
+        rate=rate,
         results=results,
         network=NetworkOptions(weights, device, precision, compiled),
         roi=_region(results, roi),

@@ -16,6 +16,7 @@ from cli.options import (
     Engine,
     Origin,
     PrecisionOption,
+    Rate,
     Threads,
     Weights,
 )
@@ -23,12 +24,15 @@ from predmapnet.machine import EngineKind, NetworkOptions, Precision, use_thread
 
 
 def infer(
-    scene: Annotated[str, typer.Argument(help="Name of the scene; `predmapnet scenes` lists them.")],
+    scene: Annotated[
+        str, typer.Argument(help="Name of the scene (`predmapnet scenes` lists them), or the folder of a log.")
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
     save_frames: Annotated[Path | None, typer.Option(help="Per-frame results to write (.parquet).")] = None,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    rate: Rate = None,
     origin: Origin = None,
     weights: Weights = None,
     device: Device = "auto",
@@ -42,7 +46,11 @@ def infer(
     from cli.console import err, progress_display, say_report, warn_of_weights
     from predmapnet.datasets.georeference import given_origin
     from predmapnet.runs.outputs import Outputs
+    from predmapnet.sources import folder_named
 
+    name: str | None = scene
+    if (folder := folder_named(scene, dataset)) is not None:
+        name, (dataset, data_root) = None, folder
     outputs = Outputs(out, recording, save_frames)
     outputs.check()
     frame_origin = None if origin is None else given_origin(origin)
@@ -50,9 +58,9 @@ def infer(
     from predmapnet.runs.infer import MappingPipeline
 
     network = NetworkOptions(weights, device, precision, compiled, engine)
-    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, frame_origin)
+    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, frame_origin, rate)
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)
     with progress_display() as display:
-        mapped = pipeline.run(scene, outputs, preparing=display.preparing, progress=display.frames)
+        mapped = pipeline.run(name, outputs, preparing=display.preparing, progress=display.frames)
     say_report(mapped.report)

@@ -21,7 +21,8 @@ class Scheme(StrEnum):
 Dataset = Annotated[
     str | None,
     typer.Option(
-        help="nuscenes, argoverse2, demo or demo-v1; or set PREDMAPNET_DATASET. Default: the demo world.",
+        help="nuscenes, argoverse2, log (your own), demo or demo-v1; or set PREDMAPNET_DATASET. "
+        "Default: the demo world.",
     ),
 ]
 DataRoot = Annotated[
@@ -37,6 +38,10 @@ OfficialFrames = Annotated[
         "--official-frames",
         help="Argoverse 2: exactly the frames of the published benchmarks, counted across all logs of a split.",
     ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(min=0.01, help="Frames per second of logs of your own. Default: 2.", show_default=False),
 ]
 Weights = Annotated[
     Path | None,

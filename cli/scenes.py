@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import DataRoot, Dataset, OfficialFrames, Scheme, SplitScheme
+from cli.options import DataRoot, Dataset, OfficialFrames, Rate, Scheme, SplitScheme
 
 
 def scenes(
@@ -15,13 +15,14 @@ def scenes(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    rate: Rate = None,
     split_scheme: SplitScheme = Scheme.OLD,
     official_frames: OfficialFrames = False,
 ) -> None:
     """List the scenes of a data set."""
     from predmapnet.sources import open_source
 
-    source, sentence = open_source(dataset, data_root, split_scheme.value, official_frames)
+    source, sentence = open_source(dataset, data_root, split_scheme.value, official_frames, rate)
     found = source.scenes(split)
     if as_json:
         import orjson

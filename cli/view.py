@@ -7,13 +7,27 @@ from typing import Annotated
 
 import typer
 
-from cli.options import AllowMissingCameras, Compile, DataRoot, Dataset, Device, PrecisionOption, Threads, Weights
+from cli.options import (
+    AllowMissingCameras,
+    Compile,
+    DataRoot,
+    Dataset,
+    Device,
+    PrecisionOption,
+    Rate,
+    Threads,
+    Weights,
+)
 from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 
 def view(
     what: Annotated[
-        str, typer.Argument(help="A scene (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb or .osm).")
+        str,
+        typer.Argument(
+            help="A scene or the folder of a log (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb "
+            "or .osm)."
+        ),
     ],
     web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
     port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
@@ -22,6 +36,7 @@ def view(
     ] = None,
     dataset: Dataset = None,
     data_root: DataRoot = None,
+    rate: Rate = None,
     weights: Weights = None,
     device: Device = "auto",
     precision: PrecisionOption = Precision.FLOAT32,
@@ -37,13 +52,17 @@ def view(
     from cli.viewer import Viewer
     from mapfusion.formats.by_suffix import SUFFIXES
     from predmapnet.runs.outputs import Outputs
+    from predmapnet.sources import folder_named
 
     ending = Path(what).suffix.lower()
     if ending == ".rrd":
         Viewer.show_file(Path(what), web, port)
         return
-    is_map = ending in SUFFIXES
-    with Viewer.open(Path(what).stem, web, port, out, live=not is_map) as viewer:
+    name: str | None = what
+    if (folder := folder_named(what, dataset)) is not None:
+        name, (dataset, data_root) = None, folder
+    is_map = name is not None and ending in SUFFIXES
+    with Viewer.open(Path(what).resolve().stem, web, port, out, live=not is_map) as viewer:
         if is_map:
             from predmapnet.recording import log_map_file
 
@@ -53,11 +72,11 @@ def view(
         from predmapnet.runs.infer import MappingPipeline
 
         network = NetworkOptions(weights, device, precision, compiled)
-        pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras)
+        pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, rate=rate)
         err.print(pipeline.sentence, markup=False)
         warn_of_weights(pipeline)
         with progress_display() as display:
             mapped = pipeline.run(
-                what, Outputs(), preparing=display.preparing, progress=display.frames, viewer=viewer.recording
+                name, Outputs(), preparing=display.preparing, progress=display.frames, viewer=viewer.recording
             )
         say_report(mapped.report)

@@ -15,7 +15,7 @@ from torch import Tensor
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
 from predmapnet.config import PredMapNetConfig
-from predmapnet.datasets.images import read_image
+from predmapnet.datasets.images import read_camera_image
 from predmapnet.engines import Engine, TorchEngine
 from predmapnet.errors import UserError
 from predmapnet.machine import EngineKind, NetworkOptions, Precision
@@ -116,9 +116,9 @@ class Mapper:
             path = frame.images.get(camera.name)
             if path is None or not path.exists():
                 if not allow_missing_cameras:
-                    raise UserError(_missing_camera(frame, camera.name, path or frame.missing.get(camera.name)))
+                    raise UserError(_missing_camera(frame, camera.name, path))
                 continue
-            images[camera.name] = _of_size(read_image(path), camera.width, camera.height, path)
+            images[camera.name] = read_camera_image(path, camera)
         if not images:
             raise UserError(
                 f"Frame {frame.index} of {frame.scene} has no image of any camera: there is nothing to map."
@@ -185,20 +185,11 @@ def choose_device(name: str) -> torch.device:
 
 
 def _missing_camera(frame: Frame, camera: str, path: Path | None) -> str:
-    expected = "the data set names no file for it" if path is None else f"{path} does not exist"
+    unknown = "the data set names no file for it" if path is None else f"{path} does not exist"
     return (
-        f"Frame {frame.index} of {frame.scene} has no image of {camera}: {expected}. "
+        f"Frame {frame.index} of {frame.scene} has no image of {camera}: {frame.missing.get(camera, unknown)}. "
         "Restore it, or map without it (--allow-missing-cameras)."
     )
-
-
-def _of_size(image: Image, width: int, height: int, path: Path) -> Image:
-    if image.shape[:2] != (height, width):
-        raise UserError(
-            f"The image {path} has {image.shape[1]} x {image.shape[0]} pixels, "
-            f"but the calibration of its camera is for {width} x {height}."
-        )
-    return image
 
 
 def to_frame_map(

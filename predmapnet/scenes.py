@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import shapely
@@ -15,6 +15,9 @@ from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.georeference import Georeference
 from mapfusion.ground import CameraSector, ground_within, region, rings_around, visible_ground
+
+if TYPE_CHECKING:
+    from predmapnet.datasets.undistortion import Lens
 
 Image = NDArray[np.uint8]
 Progress = Callable[[int, int, str], None]
@@ -36,10 +39,11 @@ class Camera:
 
     Attributes:
         name: as the data set calls it, for example ``CAM_FRONT``.
-        width, height: pixels of the images as they are stored.
+        width, height: pixels of the images as they are stored, or as they are undistorted.
         intrinsics: ``(3, 3) float64`` for images of that size.
         camera_to_ego: ``(4, 4) float64``.
         ground_height: z of the road under the car in the ego frame, metres: zero where the ego origin lies on it.
+        lens: of stored images that are distorted; all else then describes the pinhole that they are turned into.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Camera:
     intrinsics: Float
     camera_to_ego: Float
     ground_height: float = 0.0
+    lens: Lens | None = None
 
     @property
     def sector(self) -> CameraSector:
@@ -85,7 +90,7 @@ class Frame:
             official vector-map data sets.
         rig: the cameras of the car, always all of them.
         images: image files by camera name. A camera without an image is absent.
-        missing: files that the data set names but that are not there, by camera name.
+        missing: why there is no image, by name of the camera.
     """
 
     scene: str
@@ -95,7 +100,7 @@ class Frame:
     ego_to_global: Float
     rig: Rig
     images: Mapping[str, Path]
-    missing: Mapping[str, Path] = field(default_factory=dict)
+    missing: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -200,7 +205,7 @@ class SceneSource(Protocol):
 
     @property
     def name(self) -> str:
-        """``nuscenes``, ``argoverse2`` or ``demo``."""
+        """``nuscenes``, ``argoverse2``, ``log`` or ``demo``."""
         ...
 
     @property

@@ -28,7 +28,7 @@ ARGOVERSE2_CAMERAS = (
 """The cameras in the order of the official vector-map data sets."""
 SWEEP_LIST = "lidar_timestamps_ns.json"
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
-_TIME_STAMP = re.compile(r"[0-9]{1,18}")
+_TIME_STAMP = re.compile(r"[0-9]{1,19}")
 
 
 def find_logs(root: Path) -> dict[str, Path]:
@@ -62,7 +62,9 @@ def _sweep_list(path: Path) -> Integer:
 def timed_files(folder: Path, *endings: str) -> tuple[Integer, list[Path]]:
     """Files named by their time stamps: ``(n,)`` ascending nanoseconds, and the files; empty without folder."""
     found = (path for path in folder.glob("*") if path.suffix.lower() in endings)
-    files = sorted((int(path.stem), path) for path in found if _TIME_STAMP.fullmatch(path.stem))
+    files = sorted(
+        (int(path.stem), path) for path in found if _TIME_STAMP.fullmatch(path.stem) and int(path.stem) < 2**63
+    )
     return np.array([time for time, _ in files], dtype=np.int64), [path for _, path in files]
 
 

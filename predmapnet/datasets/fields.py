@@ -34,7 +34,8 @@ def numbers_field(record: Mapping[str, Any], name: str, shape: tuple[int, ...], 
     except (TypeError, ValueError):
         numbers = np.zeros(0)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise _wrong(record, name, " x ".join(map(str, shape)) + " finite numbers", where)
+        expected = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+        raise _wrong(record, name, expected, where)
     return numbers
 
 

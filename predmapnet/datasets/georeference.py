@@ -114,6 +114,10 @@ class LocalFrame:
         """Map ``(n, 2)`` metres to ``(n, 2)`` longitude and latitude, degrees."""
         return LocalPlane(0.0, 0.0, self.name).to_wgs84(points - [self.east, self.north])
 
+    def from_wgs84(self, points: Float) -> Float:
+        """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres."""
+        return np.array([self.east, self.north]) + LocalPlane(0.0, 0.0, self.name).from_wgs84(points)
+
 
 LOCAL_GRID = 100_000.0
 """Spacing of the origins of local frames, metres, so that logs of one place get the same one."""
@@ -131,9 +135,14 @@ def given_origin(text: str) -> LocalPlane:
         latitude, longitude = (float(number) for number in text.split(","))
     except ValueError as error:
         raise UserError(f"--origin {text}: latitude,longitude in degrees are expected, as in 49.01,8.41") from error
+    return plane_at(latitude, longitude, "given origin", f"--origin {text}")
+
+
+def plane_at(latitude: float, longitude: float, name: str, where: str) -> LocalPlane:
+    """Return the plane about a place, degrees; UserError with ``where`` if there is no such place for a map."""
     if not (abs(latitude) < 85 and abs(longitude) <= 180):
-        raise UserError(f"--origin {text} does not lie on Earth; latitude comes first")
-    return LocalPlane(longitude, latitude, "given origin")
+        raise UserError(f"{where} does not lie on Earth; latitude comes first")
+    return LocalPlane(longitude, latitude, name)
 
 
 def nuscenes_georeference(location: str) -> SphereGeoreference | None:

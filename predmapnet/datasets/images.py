@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from predmapnet.datasets.undistortion import undistorted
 from predmapnet.errors import UserError
+from predmapnet.scenes import Camera
 
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
@@ -44,6 +46,22 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     if image is None:
         raise UserError(f"{path} ({len(data)} bytes) is not an image that can be decoded. Copy or fetch it again.")
     return np.asarray(image, dtype=np.uint8)
+
+
+def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
+    """Read an image of a camera, undistorted: ``(camera.height, camera.width, 3) uint8``, RGB.
+
+    Raises:
+        UserError: as :func:`read_image`, or the image has not the size that its camera is calibrated for.
+    """
+    image = read_image(path)
+    stored = camera if camera.lens is None else camera.lens
+    if image.shape[:2] != (stored.height, stored.width):
+        raise UserError(
+            f"The image {path} has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"but the calibration of its camera is for {stored.width} x {stored.height}."
+        )
+    return undistorted(image, camera)
 
 
 @dataclass(frozen=True)

@@ -333,7 +333,7 @@ class NuScenesScene:
                 for channel, first in self._cameras.items()
             ),
             images={channel: path for channel, path in images.items() if path.is_file()},
-            missing={channel: path for channel, path in images.items() if not path.is_file()},
+            missing={channel: f"{path} does not exist" for channel, path in images.items() if not path.is_file()},
         )
 
     def _camera(self, channel: str, record: Record, ego_to_shifted: Float, index: int) -> Camera:

@@ -17,6 +17,8 @@ FASTEST = 100.0
 """Highest plausible median speed of a car, m/s."""
 SHORTEST_STEP = 9e5
 """Shortest plausible median step between frames, nanoseconds."""
+LONGEST_STEP = 3.6e12
+"""Longest plausible median step between frames, nanoseconds."""
 ERAS = (1e17, 5e18)
 """Times of the clock, nanoseconds since 1970, that are told by their size: 1973 to 2128."""
 MOVING = 0.3
@@ -51,7 +53,9 @@ def judged_unit(times: Integer, positions: Float, stated: str = "nanoseconds") -
         return step >= SHORTEST_STEP and metres <= FASTEST * step / 1e9
 
     def of_our_days(unit: str) -> bool:
-        return ERAS[0] <= float(times[0]) * NANOSECONDS[unit] <= ERAS[1]
+        # A clock that begins with the drive has a second in nanoseconds where others have years in seconds.
+        moderate = median_step * NANOSECONDS[unit] <= LONGEST_STEP
+        return moderate and ERAS[0] <= float(times[0]) * NANOSECONDS[unit] <= ERAS[1]
 
     by_size = [unit for unit in NANOSECONDS if of_our_days(unit)]
     others = [unit for unit in (*by_size, *reversed(NANOSECONDS)) if plausible(unit)]

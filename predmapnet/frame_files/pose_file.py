@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from predmapnet.datasets.plausibility import (
     trajectory_problem,
     unit_quaternions,
 )
+from predmapnet.datasets.pose_rows import csv_pose_rows, nanoseconds, time_column
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.errors import UserError
 from predmapnet.scenes import Instant
@@ -34,18 +32,6 @@ HOW = (
     "(x, y, z) and rotation (quaternion w, x, y, z); in CSV the columns token, timestamp, x, y and either yaw "
     "(radians) or qw, qx, qy, qz; scene (or log) is optional"
 )
-
-
-TIMES = {
-    "timestamp": 1,
-    "timestamp_ns": 1,
-    "timestamp_us": 1_000,
-    "timestamp_ms": 1_000_000,
-    "timestamp_s": 1_000_000_000,
-}
-"""Names of the time of a pose, and the nanoseconds of their unit."""
-MOST_DIGITS = 18
-"""Exponent of the largest time that is looked at."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +61,7 @@ def read_poses(path: Path, notes: list[str] | None = None) -> dict[str, FramePos
     """
     if not path.is_file():
         raise UserError(f"There is no file {path}.")
-    rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _json_rows(path)
+    rows = csv_pose_rows(path, HOW) if path.suffix.lower() == ".csv" else _json_rows(path)
     poses: dict[str, FramePose] = {}
     stated: set[bool] = set()
     for where, row in rows:
@@ -151,38 +137,14 @@ def _json_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
     return [(f"pose {row.get('token', number)}", row) for number, row in enumerate(content)]
 
 
-def _csv_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path} is no CSV in UTF-8: {error}. Save it as UTF-8.") from error
-    result: list[tuple[str, Mapping[str, Any]]] = []
-    for line, row in enumerate(rows, start=2):
-        values: dict[str, Any] = {key.strip(): value for key, value in row.items() if key and value not in (None, "")}
-        try:
-            values["translation"] = [float(values[axis]) for axis in "xy"] + [float(values.get("z", 0.0))]
-            if "yaw" in values:
-                half = float(values["yaw"]) / 2
-                values["rotation"] = [math.cos(half), 0.0, 0.0, math.sin(half)]
-            else:
-                values["rotation"] = [float(values[name]) for name in ("qw", "qx", "qy", "qz")]
-        except KeyError as error:
-            raise UserError(f"{path}, line {line}: {error} is missing. {HOW}.") from error
-        except (TypeError, ValueError) as error:
-            raise UserError(f"{path}, line {line}: {error}.") from error
-        result.append((f"line {line}", values))
-    return result
-
-
 def _pose(where: str, row: Mapping[str, Any]) -> tuple[FramePose, bool]:
     """Return a pose, and whether the name of its time says the unit."""
-    column = next((name for name in TIMES if row.get(name) is not None), "timestamp")
+    column = time_column(row)
     missing = [name for name in ("token", column) if row.get(name) is None]
     if missing:
         raise UserError(f"{where}: {' and '.join(missing)} missing. {HOW}.")
     try:
-        timestamp = _nanoseconds(row[column], column)
+        timestamp = nanoseconds(row[column], column)
         matrix = _matrix(where, row)
     except KeyError as error:
         raise UserError(f"{where}: {error} is missing. {HOW}.") from error
@@ -193,27 +155,6 @@ def _pose(where: str, row: Mapping[str, Any]) -> tuple[FramePose, bool]:
         raise UserError(f"{where}: {problem}; its rotation is {np.round(matrix[:3, :3], 3).tolist()}.")
     scene = next((row[name] for name in ("scene", "log") if row.get(name) is not None), "")
     return FramePose(str(row["token"]), timestamp, matrix, str(scene)), column != "timestamp"
-
-
-def _nanoseconds(value: Any, column: str) -> int:
-    """Return the nanoseconds of a time in the unit of its column; raises ValueError for no whole number of them."""
-    try:
-        number = Decimal(str(value).strip())
-    except InvalidOperation:
-        number = Decimal("NaN")
-    if isinstance(value, bool) or not number.is_finite():
-        raise ValueError(f"the {column} is no number: {str(value)[:40]!r}")
-    if number.adjusted() > MOST_DIGITS:
-        raise ValueError(f"the {column} {str(value)[:40]} is too large")
-    scaled = number * TIMES[column]
-    if column == "timestamp" and scaled != scaled.to_integral_value():
-        raise ValueError(
-            f"the timestamp {value} is no whole number of nanoseconds; a column timestamp_s, timestamp_ms or "
-            "timestamp_us says another unit"
-        )
-    if not -(2**63) <= scaled < 2**63:
-        raise ValueError(f"the {column} {value} is too large")
-    return round(scaled)
 
 
 def _matrix(where: str, row: Mapping[str, Any]) -> Float:

@@ -38,7 +38,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
     """Project a line on the road into a picture and keep the parts that are seen.
 
     Args:
-        points: ``(n, 2)``, metres, ego frame, on the plane z = 0.
+        points: ``(n, 2)``, metres, ego frame, on the road.
         camera: of the picture.
         spacing: distance between projected points, metres.
 
@@ -46,7 +46,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
         List of ``(k, 2) float64`` pixels.
     """
     dense = densify(points, spacing)
-    lifted = np.column_stack([dense, np.zeros(len(dense))])
+    lifted = np.column_stack([dense, np.full(len(dense), camera.ground_height)])
     rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
     rays = (lifted - position) @ rotation @ camera.intrinsics.T
     ahead = rays[:, 2] > NEAR_METRES

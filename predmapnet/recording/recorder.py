@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mapfusion.arrays import Float
 from mapfusion.colours import KIND_COLOURS, TRUTH_COLOUR, darker, lighter
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
+from predmapnet.datasets.images import read_camera_image
 from predmapnet.mapping import MapSnapshot, Step
 from predmapnet.recording.blueprint import WORLD_COORDINATES, scene_blueprint
 from predmapnet.recording.palette import raster_picture
@@ -129,7 +130,9 @@ class SceneRecorder:
                 self._recording.log(entity, rr.Clear(recursive=True))
                 continue
             # The file goes in as it is: no loss, no time, and the size that it has on disk.
-            self._recording.log(entity, rr.EncodedImage(path=path))
+            distorted = camera.lens is not None
+            picture = _compressed(read_camera_image(path, camera)) if distorted else rr.EncodedImage(path=path)
+            self._recording.log(entity, picture)
             strips, colours = [], []
             for kind, points in zip(frame_map.kinds, frame_map.polylines, strict=True):
                 parts = project_line(points, camera)
@@ -237,4 +240,8 @@ def _stretched(picture: NDArray[np.uint8]) -> rr.Image | rr.EncodedImage:
     """Enlarge a raster to the size of the BEV panel by whole steps, so that lines and pixels agree."""
     rows = np.arange(BEV_SHAPE[0]) * picture.shape[0] // BEV_SHAPE[0]
     columns = np.arange(BEV_SHAPE[1]) * picture.shape[1] // BEV_SHAPE[1]
-    return rr.Image(picture[rows][:, columns]).compress(jpeg_quality=90)
+    return _compressed(picture[rows][:, columns])
+
+
+def _compressed(picture: NDArray[np.uint8]) -> rr.Image | rr.EncodedImage:
+    return rr.Image(picture).compress(jpeg_quality=90)

@@ -46,6 +46,7 @@ class BatchSettings:
         recordings, frames: whether these files are written, too.
         threads: CPU threads of each process.
         origin: of the logs' frame, if the user says it.
+        rate: frames a second of logs of one's own; None takes the usual one.
     """
 
     dataset: str
@@ -56,6 +57,7 @@ class BatchSettings:
     frames: bool = False
     threads: int = 1
     origin: LocalPlane | None = None
+    rate: float | None = None
 
     def outputs(self, scene: str, folder: Path) -> Outputs:
         """Name the files of one scene."""
@@ -148,6 +150,7 @@ def settings_hash(settings: BatchSettings, weights_sha256: str) -> str:
         settings.network.precision,
         settings.network.compiled,
         None if settings.origin is None else [settings.origin.longitude, settings.origin.latitude],
+        settings.rate,
     ]
     return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 
@@ -272,6 +275,11 @@ def _worker_pipeline(settings: BatchSettings) -> MappingPipeline:
         from predmapnet.runs.infer import MappingPipeline
 
         _pipeline = MappingPipeline.open(
-            settings.dataset, settings.data_root, settings.network, settings.allow_missing_cameras, settings.origin
+            settings.dataset,
+            settings.data_root,
+            settings.network,
+            settings.allow_missing_cameras,
+            settings.origin,
+            settings.rate,
         )
     return _pipeline

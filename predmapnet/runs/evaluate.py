@@ -39,7 +39,7 @@ class EvaluationSettings:
 
     Attributes:
         dataset, data_root: source of frames, poses and ground truth.
-        split_scheme, official_frames: see :func:`predmapnet.sources.open_source`.
+        split_scheme, official_frames, rate: see :func:`predmapnet.sources.open_source`.
         results: a run folder, a Parquet file or a submission in JSON; None maps the scenes now.
         network: of scenes that are mapped.
         roi: region of a submission, which does not state it; see :func:`submitted_region`.
@@ -52,6 +52,7 @@ class EvaluationSettings:
     data_root: Path | None = None
     split_scheme: str = "old"
     official_frames: bool = False
+    rate: float | None = None
     results: Path | None = None
     network: NetworkOptions = field(default_factory=NetworkOptions)
     roi: RegionOfInterest = field(default_factory=RegionOfInterest)
@@ -61,7 +62,7 @@ class EvaluationSettings:
 
     def open(self) -> tuple[SceneSource, str]:
         """Open the data set; returns what :func:`predmapnet.sources.open_source` does."""
-        return open_source(self.dataset, self.data_root, self.split_scheme, self.official_frames)
+        return open_source(self.dataset, self.data_root, self.split_scheme, self.official_frames, self.rate)
 
 
 def scenes_to_measure(settings: EvaluationSettings, source: SceneSource, split: str | None) -> list[str]:
@@ -290,7 +291,8 @@ def _with_truth(scene: Scene, frame_maps: Sequence[FrameMap], cache: Path | None
         raise UserError(
             f"{scene.info.name} has no ground truth, so nothing can be measured against it; it is looked for in "
             f"maps/expansion/{scene.info.location}.json of a nuScenes data set (the map expansion, unpacked there), "
-            "and in map/log_map_archive_*.json of an Argoverse 2 log."
+            "in map/log_map_archive_*.json of an Argoverse 2 log, and in truth.json or truth.geojson of a log of "
+            "one's own."
         )
     pairs = zip(frame_maps, truths, strict=True)
     return [EvaluationFrame(scene.info.name, index, found, truth) for index, (found, truth) in enumerate(pairs)]

@@ -33,7 +33,7 @@ from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
 from predmapnet.runs.guarded_truth import GuardedTruth
 from predmapnet.runs.outputs import Outputs
 from predmapnet.scenes import Progress, Scene, SceneSource
-from predmapnet.sources import open_source
+from predmapnet.sources import only_scene, open_source
 
 FrameProgress = Callable[[int, int], None]
 """Called as ``progress(frames done, frames in all)``."""
@@ -148,18 +148,21 @@ class MappingPipeline:
         network: NetworkOptions | None = None,
         allow_missing_cameras: bool = False,
         origin: LocalPlane | None = None,
+        rate: float | None = None,
     ) -> MappingPipeline:
         """Choose the source and load the network; ``origin`` says where the logs' frame lies, if the user knows.
+
+        ``rate``: see :func:`predmapnet.sources.open_source`.
 
         Raises:
             UserError: the data set or the weights are missing or broken.
         """
-        source, sentence = open_source(dataset, data_root)
+        source, sentence = open_source(dataset, data_root, rate=rate)
         return cls(source, Mapper.from_checkpoint(network), sentence, allow_missing_cameras, origin)
 
     def run(
         self,
-        scene_name: str,
+        scene_name: str | None,
         outputs: Outputs,
         *,
         preparing: Progress | None = None,
@@ -169,7 +172,7 @@ class MappingPipeline:
         """Map one scene and write the outputs; each file appears whole or not at all.
 
         Args:
-            scene_name: as the source calls it.
+            scene_name: as the source calls it; None for the only scene that there is.
             outputs: files to write.
             preparing: called while the scene is prepared.
             progress: called after each frame.
@@ -179,6 +182,7 @@ class MappingPipeline:
             UserError: unknown scene, broken data, or a file that cannot be written.
         """
         outputs.check()
+        scene_name = scene_name or only_scene(self.source)
         start = perf_counter()
         scene = GuardedTruth(self.source.open(scene_name, preparing))
         preparing_seconds = perf_counter() - start

@@ -21,6 +21,7 @@ import numpy as np
 import orjson
 
 from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.datasets.own_logs.timed_poses import TimedPoses
 from predmapnet.demo_world.catalogue import WORLD_VERSION, build_world, default_cache
 from predmapnet.demo_world.nuscenes.writer import write_scene
 from predmapnet.demo_world.source import DemoSource
@@ -46,7 +47,6 @@ from tests.real_roads.bad_scenes import (
     off_calibration,
 )
 from tests.real_roads.image_faults import IMAGE_FAULTS
-from tests.real_roads.log_folder import Poses
 from tests.real_roads.scene_views import every
 
 CLEAN = "clean"
@@ -125,7 +125,7 @@ def at_five_hertz(name: str, cache: Path) -> Scene:
     if not folder.is_dir():
         world = build_world(name)
         stamps = world.trajectory.timestamps
-        poses = Poses(stamps, world.trajectory.ego_to_global)
+        poses = TimedPoses(stamps, world.trajectory.ego_to_global)
         dense = np.arange(stamps[0], stamps[-1] + 1, 200_000_000, dtype=np.int64)
         trajectory = Trajectory(dense, np.array([poses.at(int(stamp)) for stamp in dense]))
         write_scene(replace(world, trajectory=trajectory), folder, WORLD_VERSION, progress=_tell)

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.images import read_image
+from predmapnet.datasets.own_logs.timed_poses import TimedPoses
 from predmapnet.scenes import Camera, Frame, Instant, Rig, Scene
 from tests.real_roads.image_faults import Fault, Shot
-from tests.real_roads.log_folder import Poses, moved_rig
-from tests.real_roads.scene_views import ChosenFrames, SceneView
+from tests.real_roads.scene_views import ChosenFrames, SceneView, moved_rig
 
 Float = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def late_cameras(scene: Scene, seconds: float) -> Scene:
     The car moves on by some way between exposure and time stamp, so the cameras are told to stand that way ahead of
     where they took their images. The way is that of the real drive, between key frames along a straight line.
     """
-    poses = Poses(
+    poses = TimedPoses(
         np.array([scene.instant(index).timestamp for index in range(len(scene))], dtype=np.int64),
         np.array([scene.instant(index).ego_to_global for index in range(len(scene))]),
     )

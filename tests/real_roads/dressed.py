@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.elements import GlobalMap, RegionOfInterest
+from predmapnet.datasets.own_logs.calibration import CALIBRATION, write_rig
+from predmapnet.datasets.own_logs.scene import LogScene
+from predmapnet.datasets.own_logs.timed_poses import TimedPoses, write_timed_poses
 from predmapnet.demo_world.catalogue import WORLD_VERSION
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
@@ -22,11 +26,11 @@ from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.world import CrossingStyle, Look, Trajectory, VectorMap
 from predmapnet.files import write_file
 from predmapnet.machine import available_cores
-from predmapnet.scenes import Camera, Rig, Scene
+from predmapnet.scenes import Camera, FrameTruth, Rig, Scene
 from tests.real_roads.argoverse_logs import read_log
-from tests.real_roads.log_folder import LogScene, Poses, Truth, image_path, moved_rig, write_poses, write_rig
-from tests.real_roads.road_maps import drives_along, read_road_map, truth_along
-from tests.real_roads.scene_views import every
+from tests.real_roads.road_maps import Truth, drives_along, read_road_map, truth_along
+from tests.real_roads.scene_views import ChosenFrames, moved_rig
+from tests.real_roads.street import EVERY_IMAGE
 
 Float = NDArray[np.float64]
 T = TypeVar("T")
@@ -87,10 +91,11 @@ class DressedDrive:
         """Draw what the cache lacks of every ``step``-th frame, and return these frames as a scene."""
         folder = self.folder(cache)
         folder.mkdir(parents=True, exist_ok=True)
-        write_rig(folder / "calibration.json", self.rig)
-        write_poses(folder / "poses.csv", Poses(self.trajectory.timestamps, self.trajectory.ego_to_global))
-        self._draw(folder, range(0, len(self.trajectory.timestamps), step), progress)
-        return every(LogScene(folder, self.truth), step)
+        write_rig(folder / CALIBRATION, self.rig)
+        write_timed_poses(folder / "poses.csv", TimedPoses(self.trajectory.timestamps, self.trajectory.ego_to_global))
+        rows = range(0, len(self.trajectory.timestamps), step)
+        self._draw(folder, rows, progress)
+        return DressedScene(folder, self.trajectory.timestamps[rows].tolist(), rows, self.truth)
 
     def _draw(self, folder: Path, rows: range, progress: FrameProgress | None) -> None:
         stamps = self.trajectory.timestamps.tolist()
@@ -116,6 +121,38 @@ class DressedDrive:
             for done, _ in enumerate(pool.map(draw, lacking), start=1):
                 if progress is not None:
                     progress(done, len(lacking))
+
+
+class DressedScene(ChosenFrames):
+    """The frames of a drawn log that were asked for, with the truth of the road behind it.
+
+    Args:
+        folder: of the log.
+        stamps: of the frames, nanoseconds.
+        rows: of the frames among the poses of the drive, as the truth counts them.
+        truth: along the drive.
+    """
+
+    def __init__(self, folder: Path, stamps: Sequence[int], rows: Sequence[int], truth: Truth) -> None:
+        log = LogScene(folder, EVERY_IMAGE)
+        super().__init__(log, np.searchsorted(log.timestamps, stamps).tolist())
+        assert log.timestamps[self.rows].tolist() == stamps, f"{folder} lacks images of the camera that looks ahead"
+        self.truth_rows, self.known = list(rows), truth
+
+    def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
+        return self.known.frame(self.truth_rows[index], roi)
+
+    def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
+        """Return the truth of the frames; nothing is kept in ``cache``."""
+        return [self.known.frame(row, roi) for row in self.truth_rows]
+
+    def truth_map(self) -> GlobalMap | None:
+        return self.known.whole()
+
+
+def image_path(folder: Path, camera: str, timestamp: int) -> Path:
+    """Where the image of a camera at an instant lies."""
+    return folder / "images" / camera / f"{timestamp}.jpg"
 
 
 def dressed_logs(folder: Path) -> Iterator[DressedDrive]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,6 @@ from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
-from tests.real_roads.log_folder import Truth
 
 Float = NDArray[np.float64]
 
@@ -36,6 +36,19 @@ IN_VIEW = 15.0
 """Metres beside a drive; how much paint lies in it decides which drives are taken."""
 RARITY = 5.0
 """A metre of a crossing's outline counts as so many of a divider: crossings are rare."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true along a drive.
+
+    Attributes:
+        frame: truth of frame ``index`` of the drive's poses, clipped to a region, ego frame.
+        whole: the map of the whole drive, global frame.
+    """
+
+    frame: Callable[[int, RegionOfInterest], FrameTruth]
+    whole: Callable[[], GlobalMap]
 
 
 def read_road_map(path: Path) -> tuple[VectorMap, list[Float], VectorMap]:

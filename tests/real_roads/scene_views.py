@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
-from predmapnet.scenes import Float, Frame, FrameTruth, Georeference, Instant, Rig, Scene, SceneInfo
+from predmapnet.scenes import Camera, Float, Frame, FrameTruth, Georeference, Instant, Rig, Scene, SceneInfo
 
 
 class SceneView:
@@ -81,3 +81,8 @@ class ChosenFrames(SceneView):
 def every(scene: Scene, step: int) -> Scene:
     """Return every ``step``-th frame of a scene."""
     return scene if step == 1 else ChosenFrames(scene, range(0, len(scene), step))
+
+
+def moved_rig(rig: Rig, mounting: Callable[[Camera], Float]) -> Rig:
+    """Return a rig whose cameras sit where ``mounting`` says (``camera_to_ego``, ``(4, 4)``)."""
+    return tuple(replace(camera, camera_to_ego=mounting(camera)) for camera in rig)

@@ -1,14 +1,18 @@
 """Bad days change what a mapper is told, by as much as they say, and never what is true."""
 
+import json
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from mapfusion.elements import ElementKind, RegionOfInterest
+from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.images import read_image
+from predmapnet.datasets.own_logs.calibration import write_rig
+from predmapnet.datasets.own_logs.scene import LogScene
+from predmapnet.datasets.own_logs.timed_poses import TimedPoses, write_timed_poses
 from predmapnet.demo_world.rig import DEMO_RIG
 from tests.benchmarks.bad_days import CLEAN, Remains, conditions, mean_shares
 from tests.real_roads.bad_scenes import (
@@ -21,9 +25,9 @@ from tests.real_roads.bad_scenes import (
     noisy_poses,
     off_calibration,
 )
+from tests.real_roads.dressed import image_path
 from tests.real_roads.image_faults import brighter
-from tests.real_roads.log_folder import LogScene, Poses, image_path, write_poses, write_rig
-from tests.real_roads.street import truth_of_lines
+from tests.real_roads.street import EVERY_IMAGE
 
 FRAMES = 30
 SPEED = 6.0
@@ -40,14 +44,15 @@ def scene(tmp_path_factory):
     poses[:, 0, 3] = SPEED * 0.5 * np.arange(FRAMES)
     stamps = 500_000_000 * np.arange(1, FRAMES + 1, dtype=np.int64)
     write_rig(folder / "calibration.json", RIG)
-    write_poses(folder / "poses.csv", Poses(stamps, poses))
+    write_timed_poses(folder / "poses.csv", TimedPoses(stamps, poses))
     for camera in RIG:
         for stamp in stamps.tolist():
             path = image_path(folder, camera.name, stamp)
             path.parent.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(path), np.full((45, 80, 3), 100, dtype=np.uint8))
-    line = np.array([[-50.0, 3.0], [150.0, 3.0]])
-    return LogScene(folder, truth_of_lines([(ElementKind.DIVIDER, line)], Poses(stamps, poses)))
+    truth = {"elements": [{"kind": "divider", "points": [[-50.0, 3.0], [150.0, 3.0]]}]}
+    (folder / "truth.json").write_text(json.dumps(truth))
+    return LogScene(folder, EVERY_IMAGE)
 
 
 def angle(first, second) -> float:
