@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cli.options import Json
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -16,22 +18,24 @@ if TYPE_CHECKING:
 def compare(
     evaluations: Annotated[
         list[Path],
-        typer.Argument(help="Files of `predmapnet evaluate --json`, of the same scenes.", show_default=False),
+        typer.Argument(
+            metavar="FILE", help="Files of `predmapnet evaluate --json`, of the same scenes.", show_default=False
+        ),
     ],
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")] = False,
+    as_json: Json = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the draws for the intervals.")] = 0,
 ) -> None:
-    """Compare methods with the first one: figures with their 95 % intervals over scenes."""
+    """Set methods side by side, with intervals over scenes.
+
+    Each is compared with the first one; intervals hold 95 %.
+    """
+    from cli.console import out, print_json, say_warning
     from predmapnet.evaluation.comparison import compare_evaluations
 
     found = compare_evaluations(evaluations, seed)
     if as_json:
-        import orjson
-
-        typer.echo(orjson.dumps(found.content(), option=orjson.OPT_INDENT_2))
+        print_json(found.content())
         return
-    from cli.console import out, say_warning
-
     out.print(_table(found))
     out.print(
         "pooled: over all scenes together, as published; mean: over the scenes, with the 95 % interval of a bootstrap "

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
@@ -27,6 +29,20 @@ SECONDS_BETWEEN_LINES = 5.0
 def say_error(message: str) -> None:
     """Print an error that the user can put right."""
     err.print(f"[bold red]Error:[/] {escape(message)}")
+
+
+def print_json(content: object) -> None:
+    """Print JSON on stdout, for other programs; what JSON does not know (paths) becomes text."""
+    import orjson
+
+    sys.stdout.write(
+        orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_NON_STR_KEYS, default=str).decode() + "\n"
+    )
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: ``1 map``, ``2 maps``."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
 def say_warning(message: str) -> None:
@@ -87,21 +103,24 @@ def progress_display() -> Iterator[ProgressDisplay]:
         yield ProgressDisplay(bars)
 
 
-def report_table(report: SceneReport) -> Table:
-    """Return the table of one scene: elements and metres per kind."""
-    table = Table(title=report.scene, title_justify="left", title_style="bold", show_edge=False, pad_edge=False)
+def elements_table(title: str, elements: Mapping[str, int], metres: Mapping[str, float]) -> Table:
+    """Return the table of a map: elements and metres, both by label of the kind."""
+    from mapfusion.elements import ElementKind
+
+    table = Table(title=title or None, title_justify="left", title_style="bold", show_edge=False, pad_edge=False)
     table.add_column("")
     table.add_column("elements", justify="right")
     table.add_column("metres", justify="right")
-    for label, count in report.elements.items():
-        table.add_row(label, str(count), f"{report.metres[label]:.0f}")
+    for kind in ElementKind:
+        table.add_row(kind.nouns, f"{elements[kind.label]:,}", f"{metres[kind.label]:,.0f}")
     return table
 
 
 def report_lines(report: SceneReport) -> list[str]:
     """Return the lines below the table: time, accuracy, files."""
     prepared = f", {report.preparing_seconds:.1f} s to prepare" if report.preparing_seconds >= 1.0 else ""
-    lines = [f"{report.frames} frames in {report.seconds:.1f} s ({report.frames_per_second:.1f} frames/s){prepared}"]
+    speed = f"in {report.seconds:.1f} s ({report.frames_per_second:.1f} frames/s)"
+    lines = [f"{counted(report.frames, 'frame')} {speed}{prepared}"]
     if report.accuracy is not None:
         accuracy = report.accuracy
         lines.append(
@@ -118,14 +137,22 @@ def warn_of_weights(pipeline: MappingPipeline) -> None:
         say_warning(pipeline.warning)
 
 
-def say_report(report: SceneReport) -> None:
+def say_report(report: SceneReport, as_json: bool = False) -> None:
     """Print the report of one scene, and what the integrator rejected."""
-    out.print(report_table(report))
-    for line in report_lines(report):
-        out.print(line, markup=False)
-    for note in report.notes:
+    if as_json:
+        print_json(asdict(report))
+    else:
+        out.print(elements_table(report.scene, report.elements, report.metres))
+        for line in report_lines(report):
+            out.print(line, markup=False)
+    say_notes(report.notes, report.rejections)
+
+
+def say_notes(notes: Iterable[str], rejections: Mapping[str, int]) -> None:
+    """Print notes of a run, and what the integrator rejected."""
+    for note in notes:
         say_warning(note)
-    for reason, count in report.rejections.items():
+    for reason, count in rejections.items():
         say_warning(f"the integrator rejected {count} x {reason}")
 
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from predmapnet.scenes import SceneSource
 
 KINDS = ("ped_crossing", "divider", "boundary")
+STDOUT = Path("-")
 
 
 class Region(StrEnum):
@@ -55,6 +56,7 @@ def evaluate(
     results: Annotated[
         Path | None,
         typer.Argument(
+            metavar="RESULTS",
             help="Folder of `predmapnet batch --save-frames`, per-frame results (.parquet) or a submission (.json). "
             "Without it, or with the folder of a log, the scenes are mapped first.",
             show_default=False,
@@ -62,7 +64,7 @@ def evaluate(
     ] = None,
     split: Annotated[str | None, typer.Option(help="Only this split: train, val or test.", show_default=False)] = None,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Figures to write (JSON).", show_default=False)
+        Path | None, typer.Option("--json", metavar="FILE", help="Figures to write (.json), or - to print them.")
     ] = None,
     report: Annotated[
         Path | None,
@@ -94,16 +96,21 @@ def evaluate(
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
 ) -> None:
-    """Measure per-frame maps and maps of whole drives with the metrics of the field."""
-    from cli.console import err, out, progress_display, say_warning
+    """Measure maps against the ground truth.
+
+    Per-frame maps and maps of whole drives, with the metrics of the field.
+    """
+    from cli.console import err, out, print_json, progress_display, say_warning
+    from predmapnet import __version__
     from predmapnet.files import check_output
     from predmapnet.sources import folder_named
 
     if results is not None and (folder := folder_named(str(results), None)) is not None:
         results, (dataset, data_root) = None, folder
-    for path in (json_file, report):
+    to_stdout = json_file == STDOUT
+    for path, endings in ((None if to_stdout else json_file, (".json",)), (report, (".html", ".htm"))):
         if path is not None:
-            check_output(path)
+            check_output(path, endings, [] if results is None else [results])
     threads = max(1, available_cores() // jobs)
     use_threads(threads)
     from predmapnet.demo_world.catalogue import default_cache
@@ -145,16 +152,19 @@ def evaluate(
         "warnings": warnings,
     }
     figures = total.figures()
-    out.print(_what(context), markup=False)
-    out.print(_table(figures))
-    for line in _lines(figures):
-        out.print(line, markup=False)
+    if not to_stdout:
+        out.print(_what(context), markup=False)
+        out.print(_table(figures))
+        for line in _lines(figures):
+            out.print(line, markup=False)
     for text in (*warnings, *total.missing()):
         say_warning(text)
     if json_file is None and report is None:
         return
     per_scene = {scene.frames[0].scene: scene_figures(scene) for scene in measured}
-    if json_file is not None:
+    if to_stdout:
+        print_json({"evaluated": {"version": __version__, **context}, **figures, "per_scene": per_scene})
+    elif json_file is not None:
         write_figures(json_file, {**figures, "per_scene": per_scene}, context)
         out.print(f"written: {json_file}", markup=False)
     if report is not None:
@@ -219,15 +229,18 @@ def _origin(results: Path | None, weights: Path | None, total: Measurement) -> d
 def _table(figures: dict[str, Any]) -> Table:
     from rich.table import Table
 
+    from cli.console import counted
+    from mapfusion.elements import ElementKind
+
     table = Table(
-        title=f"{figures['scenes']} scenes, {figures['frames']} frames",
+        title=f"{counted(figures['scenes'], 'scene')}, {counted(figures['frames'], 'frame')}",
         title_justify="left",
         title_style="bold",
         show_edge=False,
         pad_edge=False,
     )
     table.add_column("")
-    for heading in ("all", *KINDS):
+    for heading in ("all", *(kind.nouns for kind in ElementKind)):
         table.add_column(heading, justify="right")
     chamfer, consistency = figures["chamfer_ap"], figures["consistency_ap"]
     _add_precisions(table, "chamfer AP", chamfer)
@@ -237,9 +250,9 @@ def _table(figures: dict[str, Any]) -> Table:
     _add_precisions(table, "  behind the car", figures["rear_ap"])
     _add_precisions(table, "order-aware AP (Frechet)", figures["frechet_ap"])
     _add_precisions(table, "rasterisation AP", figures["raster_ap"])
-    _add_precisions(table, f"consistency AP ({consistency['ids']} ids)", consistency)
+    _add_precisions(table, f"consistency AP ({_IDS[consistency['ids']]})", consistency)
     if consistency["ids"] == "tracker":
-        _add_precisions(table, "consistency AP (formed ids)", figures["consistency_ap_formed_ids"])
+        _add_precisions(table, f"consistency AP ({_IDS['formed']})", figures["consistency_ap_formed_ids"])
     stable = figures["stability"]
     _add(table, f"stability mAS ({stable['protocol']})", stable["mAS"], [stable[kind]["stability"] for kind in KINDS])
     for value in ("presence", "localisation", "shape"):
@@ -253,6 +266,8 @@ def _table(figures: dict[str, Any]) -> Table:
         _add_precisions(table, "global AP (GlobalMapNet)", figures["global_map_ap"])
     return table
 
+
+_IDS = {"tracker": "the tracker's ids", "formed": "ids matched afterwards"}
 
 _GLOBAL_ROWS = (
     ("precision@1.0", "map precision @1.0 m", 3),

@@ -14,6 +14,8 @@ from cli.options import (
     Dataset,
     Device,
     Engine,
+    Force,
+    Json,
     Origin,
     PrecisionOption,
     Rate,
@@ -25,7 +27,11 @@ from predmapnet.machine import EngineKind, NetworkOptions, Precision, use_thread
 
 def infer(
     scene: Annotated[
-        str, typer.Argument(help="Name of the scene (`predmapnet scenes` lists them), or the folder of a log.")
+        str,
+        typer.Argument(
+            metavar="SCENE",
+            help="Its name (`predmapnet scenes` lists them), or the folder of a log.",
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
@@ -41,6 +47,8 @@ def infer(
     engine: Engine = EngineKind.TORCH,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Map one scene: driving log in, global vector map out."""
     from cli.console import err, progress_display, say_report, warn_of_weights
@@ -51,7 +59,7 @@ def infer(
     name: str | None = scene
     if (folder := folder_named(scene, dataset)) is not None:
         name, (dataset, data_root) = None, folder
-    outputs = Outputs(out, recording, save_frames)
+    outputs = Outputs(out, recording, save_frames, force)
     outputs.check()
     frame_origin = None if origin is None else given_origin(origin)
     use_threads(threads)
@@ -63,4 +71,4 @@ def infer(
     warn_of_weights(pipeline)
     with progress_display() as display:
         mapped = pipeline.run(name, outputs, preparing=display.preparing, progress=display.frames)
-    say_report(mapped.report)
+    say_report(mapped.report, as_json)

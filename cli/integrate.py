@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from cli.options import Force, Json
+
 if TYPE_CHECKING:
     from mapfusion.elements import RegionOfInterest
     from mapfusion.georeference import Georeference
@@ -16,7 +18,8 @@ def integrate(
     frames: Annotated[
         Path,
         typer.Argument(
-            help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR, HDMapNet and kin."
+            metavar="FRAMES",
+            help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR, HDMapNet and kin.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
@@ -43,43 +46,50 @@ def integrate(
     normalised: Annotated[
         bool, typer.Option("--normalised", help="The results' points are shares (0 to 1) of the region's sides.")
     ] = False,
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Fuse the per-frame results of any detector into one map."""
+    from cli.console import counted, elements_table, print_json, say_notes
     from cli.console import out as screen
-    from cli.console import say_warning
     from mapfusion.elements import ElementKind
     from mapfusion.formats.by_suffix import write_map
+    from mapfusion.georeference import LOCAL_FRAME
     from mapfusion.ground import observed_rings
+    from mapfusion.provenance import united_provenance
     from predmapnet import __version__
     from predmapnet.errors import value_errors_told
     from predmapnet.runs.integrate import integrate_file
     from predmapnet.runs.outputs import Outputs
 
-    Outputs(map=out).check()
+    Outputs(map=out, force=force).check([path for path in (frames, poses) if path is not None])
     region = _region(roi)
     if location is not None or origin is not None:
         _georeference(location, origin)  # a wrong option is reported before the work begins
     done = integrate_file(frames, poses, region, min_score, y_forward, normalised)
-    synthetic = done.synthetic and location is None
-    georeference = _georeference(location or (None if origin else done.location), origin, synthetic)
-    provenance: dict[str, Any] = {
+    synthetic = bool(done.provenance.get("synthetic")) and location is None
+    named = str(done.provenance.get("location", ""))
+    georeference = _georeference(location or (None if origin else named), origin, synthetic)
+    provenance: dict[str, Any] = united_provenance([done.provenance]) | {
         "generator": "predmapnet integrate",
         "version": __version__,
         "frames_file": frames.name,
         "logs": list(done.logs),
         "observed": observed_rings(done.observed, georeference),
     }
-    if done.synthetic:
-        provenance["synthetic"] = True
+    provenance.pop(LOCAL_FRAME, None)  # its place is known now
     with value_errors_told():
         write_map(done.map, out, georeference, provenance)
-    for note in done.notes:
-        say_warning(note)
-    for reason, count in done.rejections.items():
-        say_warning(f"the integrator rejected {count} x {reason}")
-    counts = ", ".join(f"{len(done.map.of_kind(kind))} {kind.label}" for kind in ElementKind)
-    screen.print(f"{done.frames} frames of {len(done.logs)} drives: {counts}", markup=False)
-    screen.print(f"written: {out}", markup=False)
+    elements = {kind.label: len(done.map.of_kind(kind)) for kind in ElementKind}
+    metres = {kind.label: done.map.length(kind) for kind in ElementKind}
+    if as_json:
+        told = {"frames": done.frames, "logs": done.logs, "elements": elements, "metres": metres}
+        print_json({**told, "rejections": done.rejections, "notes": done.notes, "written": [out]})
+    else:
+        screen.print(elements_table("", elements, metres))
+        screen.print(f"{counted(done.frames, 'frame')} of {counted(len(done.logs), 'drive')}", markup=False)
+        screen.print(f"written: {out}", markup=False)
+    say_notes(done.notes, done.rejections)
 
 
 def _region(text: str) -> RegionOfInterest:

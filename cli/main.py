@@ -1,7 +1,6 @@
 """Entry point of the command line: the commands, and the messages and exit codes of errors.
 
-Exit codes: 0 done, 1 some scenes of a batch failed, 2 a wrong option or broken input (the message names it),
-3 a fault of PredMapNet itself, 130 stopped with Ctrl-C.
+Exit codes: see ``EXIT_CODES``.
 """
 
 from __future__ import annotations
@@ -9,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Callable
 from typing import Annotated, NoReturn
 
 import typer
@@ -21,32 +21,47 @@ from cli.evaluate import evaluate
 from cli.infer import infer
 from cli.integrate import integrate
 from cli.merge import merge
+from cli.plain_help import PlainCommand
 from cli.scenes import scenes
 from cli.train import train
 from cli.view import view
 from cli.weights import weights
 from predmapnet.errors import UserError
 
+EXIT_CODES = """\b
+Exit codes:
+  0    done
+  1    some scenes of a batch failed; maps differ (diff --exit-code)
+  2    a wrong option or a broken input: the message names it
+  3    a fault of PredMapNet itself
+  130  stopped with Ctrl-C"""
+
 DISK_IS_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 app = typer.Typer(
     name="predmapnet",
-    help="From driving logs to clean vector maps. Start with:  predmapnet infer scene-0103 --out map.geojson",
+    help="From driving logs to clean vector maps. Start with:\n\npredmapnet infer scene-0103 --out map.geojson",
+    epilog=EXIT_CODES,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
+    rich_markup_mode=None,  # plain help, whole at any width
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(infer)
-app.command()(view)
-app.command()(batch)
-app.command()(scenes)
-app.command()(evaluate)
-app.command()(compare)
-app.command()(train)
+COMMANDS: tuple[Callable[..., None], ...] = (
+    infer,
+    view,
+    batch,
+    scenes,
+    evaluate,
+    compare,
+    train,
+    integrate,
+    merge,
+    diff,
+)
+for command in COMMANDS:
+    app.command(cls=PlainCommand)(command)
 app.add_typer(weights)
-app.command()(integrate)
-app.command()(merge)
-app.command()(diff)
 
 
 def _version(wanted: bool) -> None:
@@ -74,7 +89,7 @@ def options(
 def main() -> None:
     """Run a command; turn errors into one message and an exit code."""
     try:
-        app()
+        app(prog_name="predmapnet")
     except SystemExit as end:
         if end.code == 130:
             say_error("stopped; files that were not finished have been removed")

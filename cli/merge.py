@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-if TYPE_CHECKING:
-    from rich.table import Table
+from cli.options import Force, Json
 
+if TYPE_CHECKING:
     from mapfusion.merge.report import MergeReport
 
 
 def merge(
-    maps: Annotated[list[Path], typer.Argument(help="Maps of one city, in any order; a folder means all maps in it.")],
+    maps: Annotated[
+        list[Path],
+        typer.Argument(metavar="MAP", help="Maps of one city, in any order; a folder means all maps in it."),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Map to write.")],
     tile: Annotated[
         float, typer.Option(min=50.0, help="Side of a tile, metres; larger tiles need more memory.")
     ] = 200.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
     style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
-    """Merge the maps of many drives: drives are aligned where that is certain, evidence is added up."""
+    """Merge the maps of many drives into one.
+
+    Drives are aligned where that is certain, and their evidence is added up.
+    """
+    from cli.console import counted, elements_table, print_json, progress_display, say_warning
     from cli.console import out as screen
-    from cli.console import progress_display, say_warning
     from mapfusion.formats.by_suffix import check_suffix
     from mapfusion.formats.qgis_style import write_styles
     from mapfusion.merge.config import MergeConfig
@@ -33,14 +42,21 @@ def merge(
     from predmapnet.errors import value_errors_told
     from predmapnet.files import check_output
 
-    check_output(out)
-    with value_errors_told(), progress_display() as display:
+    with value_errors_told():
         check_suffix(out)
-        paths = _files(maps, out)
+    paths = _files(maps, out)
+    check_output(out, (), paths, force)
+    with value_errors_told(), progress_display() as display:
         report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
-    screen.print(_summary(report))
-    for line in _lines(report):
-        screen.print(line, markup=False)
+    written = [out, *(write_styles(out) if style else ())]
+    if as_json:
+        print_json({**asdict(report), "written": written})
+    else:
+        screen.print(elements_table("", report.elements, report.metres))
+        screen.print(_alignment_sentence(report), markup=False)
+        screen.print("\n".join(f"written: {path}" for path in written), markup=False)
+    if not sum(report.elements.values()):
+        say_warning(f"{out} is empty: none of the {counted(len(report.maps), 'map')} holds an element")
     for status in report.maps:
         if status.note:
             kept = "kept apart, its elements are in the map as they are" if status.apart else "merged as it lies"
@@ -49,8 +65,6 @@ def merge(
         say_warning(f"{name}: {note}")
     for name in report.duplicates:
         say_warning(f"{name} is the same as another map and counts once")
-    written = [out, *(write_styles(out) if style else ())]
-    screen.print("\n".join(f"written: {path}" for path in written), markup=False)
 
 
 def _files(maps: list[Path], out: Path) -> list[Path]:
@@ -74,22 +88,12 @@ def _files(maps: list[Path], out: Path) -> list[Path]:
     return paths
 
 
-def _summary(report: MergeReport) -> Table:
-    from rich.table import Table
+def _alignment_sentence(report: MergeReport) -> str:
+    from cli.console import counted
 
-    table = Table(show_edge=False, pad_edge=False)
-    table.add_column("")
-    table.add_column("elements", justify="right")
-    table.add_column("metres", justify="right")
-    for label, count in report.elements.items():
-        table.add_row(label, str(count), f"{report.metres[label]:.0f}")
-    return table
-
-
-def _lines(report: MergeReport) -> list[str]:
     aligned = [status for status in report.maps if status.partners]
     moved = sorted(status.shift for status in aligned)
-    lines = [f"{len(report.maps)} maps in {report.tiles} tiles; {len(aligned)} aligned with others"]
+    sentence = f"{counted(len(report.maps), 'map')} in {counted(report.tiles, 'tile')}; {len(aligned)} aligned"
     if moved:
-        lines[0] += f", moved by {moved[len(moved) // 2]:.2f} m (median), {moved[-1]:.2f} m at most"
-    return lines
+        sentence += f", moved by {moved[len(moved) // 2]:.2f} m (median), {moved[-1]:.2f} m at most"
+    return sentence

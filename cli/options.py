@@ -76,6 +76,10 @@ Origin = Annotated[
         show_default=False,
     ),
 ]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace a map even if it was changed by hand since it was written.")
+]
 AllowMissingCameras = Annotated[
     bool,
     typer.Option("--allow-missing-cameras", help="Map frames without the images of some cameras, instead of stopping."),

@@ -15,8 +15,8 @@ import shapely
 from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.files import write_whole
-from mapfusion.formats.geojson import geometry_of
+from mapfusion.formats.geojson import geometry_of, origin_of
+from mapfusion.formats.seal import write_sealed
 from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 from mapfusion.ground import coverage, inside
@@ -103,6 +103,11 @@ class MapDiff:
         """Length of one change of one kind, metres."""
         return sum(d.length for d in self.differences if d.change is change and d.kind is kind)
 
+    @property
+    def changed(self) -> bool:
+        """Whether anything was added, removed or moved."""
+        return any(d.change in (Change.ADDED, Change.REMOVED, Change.MOVED) for d in self.differences)
+
     def count(self, change: Change, kind: ElementKind) -> int:
         """Number of stretches or crossings."""
         return sum(d.change is change and d.kind is kind for d in self.differences)
@@ -162,8 +167,9 @@ def write_diff(
         OSError: the file cannot be written.
     """
     features = [_feature(item, georeference) for item in difference.differences]
-    document = {"type": "FeatureCollection", "predmapnet": provenance or {}, "features": features}
-    with write_whole(path) as temporary:
+    origin = origin_of(provenance or {}, georeference)
+    document = {"type": "FeatureCollection", "predmapnet": origin, "features": features}
+    with write_sealed(path) as temporary:
         temporary.write_text(json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
 
 

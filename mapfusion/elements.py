@@ -33,6 +33,16 @@ class ElementKind(IntEnum):
         return self.name.lower()
 
     @property
+    def nouns(self) -> str:
+        """Plural for people: ``crossings``, ``dividers``, ``boundaries``."""
+        return ("crossings", "dividers", "boundaries")[self]
+
+    @property
+    def noun(self) -> str:
+        """Singular for people: ``crossing``, ``divider``, ``boundary``."""
+        return ("crossing", "divider", "boundary")[self]
+
+    @property
     def is_ring(self) -> bool:
         """Whether elements of this kind are closed rings (first vertex repeated at the end)."""
         return self is ElementKind.PED_CROSSING

@@ -7,23 +7,27 @@ import hashlib
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mapfusion.files
+from mapfusion.formats.by_suffix import SUFFIXES
+from mapfusion.formats.seal import edited_since_written
 from predmapnet.errors import UserError
 
 
-def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
+def check_output(path: Path, endings: tuple[str, ...] = (), inputs: Sequence[Path] = (), force: bool = False) -> None:
     """Check before the work begins that a file can be written at ``path``.
 
     Args:
         path: of the file.
         endings: those that the name may have, in lower case; all without.
+        inputs: files that are read, and must not be lost.
+        force: replace a map that was changed since we wrote it.
 
     Raises:
-        UserError: the folder does not exist or cannot be written to, ``path`` is a folder itself, or another program
-            has it open.
+        UserError: the folder does not exist or cannot be written to, ``path`` is a folder itself or an input, it holds
+            a map that somebody has changed, or another program has it open.
     """
     if endings and path.suffix.lower() not in endings:
         raise UserError(f"cannot write {path}: only {' or '.join(endings)} can be written there, not '{path.suffix}'")
@@ -34,6 +38,8 @@ def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
         raise UserError(f"cannot write {path.name}: the folder {folder} does not exist; create it or choose another")
     if not folder.is_dir():
         raise UserError(f"cannot write {path.name}: {folder} is a file, not a folder")
+    if path.exists():
+        _check_loss(path, inputs, force)
     companion = mapfusion.files.companion_of_open_file(path.resolve() if path.is_symlink() else path)
     if companion is not None:
         raise UserError(
@@ -42,6 +48,17 @@ def check_output(path: Path, endings: tuple[str, ...] = ()) -> None:
         )
     with write_errors_told(path), tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".part") as trial:
         trial.write(b" ")
+
+
+def _check_loss(path: Path, inputs: Sequence[Path], force: bool) -> None:
+    """Raise UserError if writing to a file that exists would lose what nobody can make again."""
+    if any(given.exists() and given.samefile(path) for given in inputs):
+        raise UserError(f"cannot write {path}: it is an input, too, and would be lost; choose another name")
+    if not force and path.suffix.lower() in SUFFIXES and edited_since_written(path):
+        raise UserError(
+            f"cannot write {path}: the map in it was changed after PredMapNet wrote it, by hand or by another program, "
+            "and these changes would be lost. Choose another name, or add --force"
+        )
 
 
 @contextlib.contextmanager

@@ -20,13 +20,13 @@ import shapely
 import shapely.geometry
 
 from mapfusion.elements import GlobalMap
-from mapfusion.files import write_whole
 from mapfusion.formats.features import HEIGHTS, Feature, map_of
 from mapfusion.formats.foreign_values import number_of
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.identities import all_named
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
+from mapfusion.formats.seal import write_sealed
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 LINES, CROSSINGS = "lines", "crossings"
@@ -50,7 +50,7 @@ def write_geodatabase(
     features = [feature_of(element, georeference) for element in all_named(global_map)]
     origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     rows = list(enumerate(features))
-    with write_whole(path) as temporary, _plain_folder(temporary) as plain:
+    with write_sealed(path) as temporary, _plain_folder(temporary) as plain:
         try:
             if path.suffix.lower() == ".fgb":
                 _write_layer(plain, FLAT, path.stem, "Unknown", rows, origin)

@@ -16,12 +16,12 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.files import write_whole
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.foreign_values import format_timestamp
 from mapfusion.formats.identities import ElementNames
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
+from mapfusion.formats.seal import SEAL, UNSEALED, write_sealed
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 DECIMALS = 10
@@ -107,16 +107,16 @@ class GeoJsonWriter:
         document["predmapnet"] = origin_of(self._provenance, self._georeference)
         head = json.dumps(document, separators=(",", ":"), allow_nan=False)[:-1]
         self._body.seek(0)
-        with write_whole(self._path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        with write_sealed(self._path) as temporary, temporary.open("w", encoding="utf-8") as file:
             file.write(f'{head},"features":[')
             shutil.copyfileobj(self._body, file)
             file.write("\n]}\n" if self._count else "]}\n")
 
 
 def origin_of(provenance: Mapping[str, Any], georeference: Georeference) -> dict[str, Any]:
-    """Return the provenance that every format writes, completed by georeference and time."""
+    """Return the provenance that every format writes, completed by georeference, time and an empty seal."""
     created = datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    return {**provenance, "georeference": georeference.name, "created": created}
+    return {**provenance, "georeference": georeference.name, "created": created, SEAL: UNSEALED}
 
 
 def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:

@@ -28,6 +28,7 @@ from mapfusion.files import write_whole
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.identities import StableNumbers, all_named
 from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.formats.seal import write_sealed
 from mapfusion.georeference import LOCAL_FRAME, Georeference
 
 TYPES = {
@@ -61,7 +62,7 @@ def write_lanelet(
     sheet = _Sheet(local=LOCAL_FRAME in origin)
     for element in all_named(global_map):
         sheet.add(element, georeference)
-    with write_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with write_sealed(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(
             '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" upload="false" generator="predmapnet">\n'
         )

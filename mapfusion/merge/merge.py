@@ -29,6 +29,7 @@ from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.report import MapStatus, MergeReport, notes_of_copies, short_names
 from mapfusion.merge.tile_fusion import fuse_tile, named
 from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, tiles_of
+from mapfusion.provenance import united_provenance
 from mapfusion.road_heights import filled, rises
 
 Progress = Callable[[int, int, str], None]
@@ -160,7 +161,7 @@ def merge_files(
     plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
     names = short_names(paths)
     merge = _Merge(_MapCache(list(paths), plane), names, config or MergeConfig())
-    told = {"generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
+    told = {**merge.provenance, "generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
     observed = merge.observed()
     if observed is not None:
         told["observed"] = observed
@@ -176,7 +177,9 @@ class _Merge:
     def __init__(self, cache: _MapCache, names: Sequence[str], config: MergeConfig) -> None:
         self.cache = cache
         self.config = config
-        entries = [entry for entry in (_summary(cache, i, name) for i, name in enumerate(names)) if entry is not None]
+        looked = [(_summary(cache, i, name), cache.raw(i).provenance) for i, name in enumerate(names)]
+        entries = [entry for entry, _ in looked if entry is not None]
+        self.provenance = united_provenance(told for _, told in looked)
         entries.sort(key=lambda entry: (-entry.evidence, entry.digest, entry.name))
         first: dict[str, _MapSummary] = {}
         for entry in entries:

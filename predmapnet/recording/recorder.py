@@ -53,7 +53,7 @@ class SceneRecorder:
         """Log what does not change: layout, cameras, the car, the ground truth."""
         rec = self._recording
         rec.send_blueprint(scene_blueprint(scene.rig, BEV_SHAPE, play=self._live))
-        rec.log("description", rr.TextDocument(self._description, media_type="text/markdown"), static=True)
+        self.describe(self._description)
         rec.log("world", WORLD_COORDINATES, static=True)
         for camera in scene.rig:
             self._log_camera(camera)
@@ -70,6 +70,10 @@ class SceneRecorder:
             strips = [self._in_world(element.points, height=-0.04) for element in truth]
             lines = rr.LineStrips3D(strips, colors=TRUTH_COLOUR, radii=rr.Radius.ui_points(0.6))
             rec.log("world/ground_truth", lines, static=True)
+
+    def describe(self, text: str) -> None:
+        """Log the description of the run, Markdown; a later one replaces it."""
+        self._recording.log("description", rr.TextDocument(text, media_type="text/markdown"), static=True)
 
     def observe(self, step: Step, snapshot: MapSnapshot) -> None:
         """Log one frame."""

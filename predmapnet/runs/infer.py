@@ -30,6 +30,7 @@ from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.mapping import MapSnapshot, Observer, SceneRun, Step, map_scene
 from predmapnet.recording import APPLICATION, RecordingFile, SceneRecorder
+from predmapnet.runs.gaps import with_gaps
 from predmapnet.runs.guarded_truth import GuardedTruth
 from predmapnet.runs.outputs import Outputs
 from predmapnet.scenes import Progress, Scene, SceneSource
@@ -192,16 +193,20 @@ class MappingPipeline:
         if isinstance(georeference, LocalFrame):
             provenance[LOCAL_FRAME] = georeference.frame
         with ExitStack() as files:
-            observers: list[Observer] = []
+            recorders: list[SceneRecorder] = []
             if viewer is not None:
-                observers.append(SceneRecorder(viewer, describe(provenance), live=True))
+                recorders.append(SceneRecorder(viewer, describe(provenance), live=True))
             if outputs.recording is not None:
                 recording = rr.RecordingStream(APPLICATION, recording_id=f"{self.source.name}-{scene_name}")
                 files.enter_context(RecordingFile(recording, outputs.recording))
-                observers.append(SceneRecorder(recording, describe(provenance)))
+                recorders.append(SceneRecorder(recording, describe(provenance)))
+            observers: list[Observer] = [*recorders]
             if progress is not None:
                 observers.append(_ProgressObserver(progress))
             run = map_scene(scene, self.mapper, observers, self._allow_missing_cameras)
+            provenance, gaps = with_gaps(provenance, run)
+            for recorder in recorders if gaps else ():
+                recorder.describe(describe(provenance))
             if outputs.map is not None:
                 observed = observed_rings(run.observed, georeference)
                 with value_errors_told():
@@ -210,6 +215,7 @@ class MappingPipeline:
                 pairs = zip(run.frames, run.frame_maps, strict=True)
                 stored = (StoredFrame(frame.scene, frame.index, frame.token, mapped) for frame, mapped in pairs)
                 write_frames(outputs.frames, stored, provenance)
+        notes += gaps
         accuracy = scene.guarded(lambda: measure(scene, run, self.mapper.roi))
         if scene.problem:
             accuracy = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import shapely
 
 from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
 from mapfusion.ground import seen_along
+from mapfusion.provenance import united_provenance
 from mapfusion.road_heights import RoadHeights
 from predmapnet.errors import UserError
 from predmapnet.frame_files.maptr import read_detections
@@ -19,6 +20,7 @@ from predmapnet.frame_files.parquet import read_frames
 from predmapnet.frame_files.pose_file import FramePose, read_poses
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name
 from predmapnet.mapping import NETWORK_ERRORS, check_left_out
+from predmapnet.runs.gaps import empty_sentence
 
 NAMED = 3
 """Number of tokens that a message names."""
@@ -43,8 +45,7 @@ class Integration:
         rejections: of the integrator, counted by reason.
         notes: for the user.
         observed: ground seen in the fused frames, global frame, metres.
-        location: of the data set, if the frames name it.
-        synthetic: whether the frames are of the demo world.
+        provenance: of the frames, if they state any.
     """
 
     map: GlobalMap
@@ -53,8 +54,7 @@ class Integration:
     rejections: Mapping[str, int]
     observed: shapely.Geometry
     notes: tuple[str, ...] = ()
-    location: str = ""
-    synthetic: bool = False
+    provenance: Mapping[str, Any] = field(default_factory=dict)
 
 
 def integrate_file(
@@ -93,8 +93,11 @@ def integrate_file(
         submitted = read_detections(frames, notes, region if normalised else None, y_forward)
         known = read_poses(poses, notes)
         logged = _placed(frames, poses, submitted, known, region, min_score, notes)
-    location, synthetic = str(provenance.get("location", "")), bool(provenance.get("synthetic"))
-    return replace(integrate_frames(logged), notes=tuple(notes), location=location, synthetic=synthetic)
+    found = integrate_frames(logged)
+    if len(found.map) == 0:
+        notes.append(empty_sentence(found.frames))
+        provenance = united_provenance([provenance, {"note": notes[-1]}])
+    return replace(found, notes=tuple(notes), provenance=provenance)
 
 
 def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,22 +19,24 @@ class Outputs:
         map: GeoJSON, GeoPackage, FlatGeobuf or Lanelet2, by its ending.
         recording: Rerun recording.
         frames: per-frame results (Parquet).
+        force: replace a map that was changed since we wrote it.
     """
 
     map: Path | None = None
     recording: Path | None = None
     frames: Path | None = None
+    force: bool = False
 
     @property
     def paths(self) -> tuple[Path, ...]:
         """All paths that are written."""
         return tuple(path for path in (self.map, self.recording, self.frames) if path is not None)
 
-    def check(self) -> None:
-        """Check before the work begins that all of them can be written. Raises UserError."""
+    def check(self, inputs: Sequence[Path] = ()) -> None:
+        """Check before the work begins that all of them can be written, and none is an input. Raises UserError."""
         for path, endings in ((self.map, ()), (self.recording, (".rrd",)), (self.frames, (".parquet",))):
             if path is not None:
-                check_output(path, endings)
+                check_output(path, endings, inputs, self.force)
         if len({path.absolute() for path in self.paths}) < len(self.paths):
             raise UserError("two outputs have the same name; give each its own")
         if self.map is not None:

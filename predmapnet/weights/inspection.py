@@ -32,7 +32,7 @@ class TensorInfo:
 
     @property
     def count(self) -> int:
-        """Numbers in it."""
+        """Parameters in it."""
         return prod(self.shape)
 
 
@@ -71,7 +71,7 @@ class WeightsInfo:
         return tuple(name for name, on in switches.items() if on)
 
     def parts(self) -> dict[str, int]:
-        """Return how many numbers each part of the network has, in the order of the file."""
+        """Return how many parameters each part of the network has, in the order of the file."""
         counts: dict[str, int] = {}
         for tensor in self.tensors:
             part = tensor.name.split(".")[0]

@@ -122,5 +122,5 @@ def test_what_the_reader_changed_is_printed(infer, predmapnet, tmp_path):
 
 
 def test_scenes_tells_logs_without_images_from_towns_that_are_yet_to_be_drawn(predmapnet, tiny_root):
-    assert "made when used" not in predmapnet("scenes", "--data-root", tiny_root).out
-    assert "made when used" in predmapnet("scenes", "--dataset", "demo", "--split", "test").out
+    assert "drawn when used" not in predmapnet("scenes", "--data-root", tiny_root).out
+    assert "drawn when used" in predmapnet("scenes", "--dataset", "demo", "--split", "test").out

@@ -16,6 +16,7 @@ from rerun.chunk import RrdReader
 from mapfusion.formats.by_suffix import read_map
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import save_checkpoint
 from predmapnet.weights.files import weights_hash
 from tests.cli.tiny_nuscenes import edit_table, image_path, write_tiny_nuscenes
@@ -65,6 +66,32 @@ def test_a_scene_becomes_a_map_a_recording_and_a_table_of_frames(infer, tmp_path
     assert {"/world/ego_vehicle", "/world/ego_vehicle/CAM_FRONT", "/world/ego_vehicle/tracks/divider"} <= entities
     assert any(entity.startswith("/world/map/") for entity in entities)
     assert leftovers(tmp_path) == []
+
+
+def test_json_tells_other_programs_what_the_table_tells_people(infer, tmp_path):
+    result = infer("scene-0001", "--out", "map.geojson", "--json")
+    assert result.code == 0, result.err
+    told = json.loads(result.out)
+    assert told["scene"] == "scene-0001"
+    assert told["frames"] == 3
+    assert sum(told["elements"].values()) == len(read_map(tmp_path / "map.geojson"))
+    assert told["written"] == ["map.geojson"]
+
+
+def test_an_empty_map_is_said_and_written_down(predmapnet, tiny_root, tmp_path):
+    config = preset("lite")
+    sure = config.tracking.model_copy(update={"tau_d": 0.999, "tau_t": 0.999})
+    save_checkpoint(tmp_path / "w.safetensors", PredMapNet(config.model_copy(update={"tracking": sure})))
+    options = ("--data-root", tiny_root, "--weights", "w.safetensors", "--threads", 1)
+    result = predmapnet("infer", "scene-0001", "--out", "map.geojson", "--save-frames", "f.parquet", *options)
+    assert result.code == 0, result.err
+    assert "The map is empty" in result.err
+    found = read_map(tmp_path / "map.geojson")
+    assert len(found) == 0
+    assert "The map is empty" in found.provenance["note"]
+    again = predmapnet("integrate", "f.parquet", "--out", "again.geojson")
+    assert "The map is empty" in again.err
+    assert "The map is empty" in read_map(tmp_path / "again.geojson").provenance["note"]
 
 
 def test_a_map_in_bfloat16_says_so(infer, tmp_path):

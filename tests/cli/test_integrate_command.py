@@ -85,7 +85,7 @@ def test_a_submission_with_ids_gives_the_same_map(predmapnet, tmp_path, drive, r
     write(tmp_path / "poses.json", poses(drive))
     result = predmapnet("integrate", "results.json", "--poses", "poses.json", "--origin", ORIGIN, "--out", "map.gpkg")
     assert result.code == 0, result.err
-    assert "12 frames of 1 drives" in result.out
+    assert "12 frames of 1 drive" in result.out
     assert_like(read_map(tmp_path / "map.gpkg", PLANE), reference, 1e-4)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from rerun.chunk import RrdReader
 
 from mapfusion.elements import RegionOfInterest
 from mapfusion.formats.by_suffix import read_map
@@ -47,6 +48,23 @@ def test_a_map_claims_no_ground_that_only_a_missing_camera_would_have_seen(
         area[name] = observed_area(tmp_path / "map.geojson")
     assert area["all"] == pytest.approx(roi.length * roi.width, rel=0.01)
     assert 0.5 * area["all"] < area["without"] < 0.8 * area["all"]
+
+
+def test_missing_images_are_said_and_written_into_every_file(predmapnet, random_weights, tmp_path):
+    root = without_camera(tmp_path / "gap", "CAM_BACK", frames=2)
+    options = ("--data-root", root, "--weights", random_weights, "--threads", 1, "--allow-missing-cameras")
+    files = ("--out", "map.geojson", "--save-frames", "f.parquet", "--recording", "r.rrd")
+    result = predmapnet("infer", "scene-0001", *files, *options)
+    assert "CAM_BACK in 2 of 2 frames" in " ".join(result.err.split())
+    provenance = read_map(tmp_path / "map.geojson").provenance
+    assert provenance["missing_images"] == {"CAM_BACK": 2}
+    assert "CAM_BACK in 2 of 2 frames" in provenance["note"]
+    assert predmapnet("integrate", "f.parquet", "--out", "again.geojson").code == 0
+    assert read_map(tmp_path / "again.geojson").provenance["missing_images"] == {"CAM_BACK": 2}
+    chunks = [chunk for chunk in RrdReader(tmp_path / "r.rrd").stream() if chunk.entity_path == "/description"]
+    assert any(
+        "CAM_BACK in 2 of 2 frames" in str(chunk.to_record_batch().column("TextDocument:text")) for chunk in chunks
+    )
 
 
 def test_a_script_that_loops_over_frames_gets_the_map_of_the_command(predmapnet, random_weights, tmp_path):

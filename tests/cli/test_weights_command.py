@@ -42,7 +42,7 @@ def test_mistakes_are_explained(predmapnet, tmp_path):
     absent = predmapnet("weights", "import", tmp_path / "absent.pth", "--out", tmp_path / "w.safetensors")
     assert (absent.code, "There is no file" in absent.err) == (2, True)
     wrong = predmapnet("weights", "import", tmp_path / "absent.pth", "--out", tmp_path / "w.bin")
-    assert (wrong.code, "name a file that ends so" in wrong.err) == (2, True)
+    assert (wrong.code, "only .safetensors can be written" in wrong.err) == (2, True)
     torch.save({"state_dict": {"head.other": torch.zeros(2)}}, tmp_path / "other.pth")
     other = predmapnet("weights", "import", tmp_path / "other.pth", "--out", tmp_path / "w.safetensors")
     assert (other.code, "1 unknown: head.other" in other.err) == (2, True)
@@ -64,4 +64,4 @@ def test_weights_of_other_programs_are_shown_as_such(predmapnet, tmp_path):
     shown = predmapnet("weights", "inspect", tmp_path / "foreign.safetensors")
     assert shown.code == 0
     assert "not written by PredMapNet" in shown.out
-    assert "1 tensors, 6 numbers" in shown.out
+    assert "1 tensor, 6 parameters" in shown.out
