@@ -7,17 +7,31 @@ from typing import Annotated
 
 import typer
 
+from cli.options import Scheme, SplitScheme
+
 
 def train(
     out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics.jsonl and the weights.")],
     preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file of one.")] = "lite",
-    data: Annotated[str, typer.Option(help="Training data: demo.")] = "demo",
+    data: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="demo, nuscenes, argoverse2 or log; several times for several, each with :WEIGHT behind it or not "
+            "(nuscenes:3 sees each frame three times an epoch).",
+            show_default="demo",
+        ),
+    ] = None,
+    data_root: Annotated[
+        list[Path] | None,
+        typer.Option(help="Folder of each data set but demo, in their order.", show_default=False),
+    ] = None,
+    split_scheme: SplitScheme = Scheme.OLD,
     stage: Annotated[
         str, typer.Option(help="all, or one of: single, temporal (lite); bev, warmup, joint (paper, maptracker).")
     ] = "all",
     minutes: Annotated[float, typer.Option(min=0.1, help="Time budget, shared out over the stages.")] = 60.0,
     steps: Annotated[int, typer.Option(min=0, help="Limit of optimiser steps per stage; 0 for none.")] = 0,
-    towns: Annotated[int, typer.Option(min=1, help="Number of training scenes.")] = 160,
+    towns: Annotated[int, typer.Option(min=1, help="Training scenes of the demo world.")] = 160,
     batch: Annotated[
         int | None,
         typer.Option(min=1, help="Per step, over all processes: frames (lite: 6) or clips (paper, maptracker: 1)."),
@@ -44,17 +58,21 @@ def train(
 
     from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.training import run
+    from predmapnet.training.data.prepare import DataOptions, parse_data_sets
     from predmapnet.training.settings import plan_run, trains_in_clips
 
-    run.check_data(data)
     config = run.configuration(preset)
-    options = run.RunOptions(
-        config=config,
-        data=data,
-        folder=out,
+    chosen = DataOptions(
+        sets=parse_data_sets(data or ["demo"], data_root or []),
         cache=cache or default_cache() / "training",
         towns=towns,
-        validation_towns=2 if trains_in_clips(config) else 10,
+        validation=2 if trains_in_clips(config) else 10,
+        split_scheme=split_scheme.value,
+    )
+    options = run.RunOptions(
+        config=config,
+        data=chosen,
+        folder=out,
         processes=processes,
         threads=threads,
         settings=plan_run(config, stage, minutes, steps or None, batch, learning_rate, seed),
@@ -63,7 +81,7 @@ def train(
         device=device,
     )
     typer.echo(
-        f"Training '{preset}' on {towns} scenes of '{data}' for {minutes:g} minutes (stage {stage}) "
+        f"Training '{preset}' on {chosen} for {minutes:g} minutes (stage {stage}) "
         f"with {processes} x {threads} threads. Everything goes to {out}."
     )
     weights = run.train_network(options, typer.echo)

@@ -70,6 +70,12 @@ def window_intrinsics(camera: Camera, config: ImageConfig) -> Float:
     return intrinsics
 
 
+def window_camera(camera: Camera, config: ImageConfig) -> Camera:
+    """Return the camera that takes exactly the network's window of ``camera``, pixel for pixel."""
+    intrinsics = window_intrinsics(camera, config)
+    return replace(camera, width=config.width, height=config.height, intrinsics=intrinsics)
+
+
 def ego_to_image(rig: Rig, config: ImageConfig) -> Float:
     """Return the projections ``(N, 4, 4)``: from metres of the ego frame to (u depth, v depth, depth, 1).
 
@@ -162,21 +168,3 @@ def stack_windows(images: Mapping[str, Image], rig: Rig, config: ImageConfig) ->
     blank = np.zeros((config.height, config.width, 3), np.float32 if config.kind == "whole" else np.uint8)
     windows = [crop_image(images[camera.name], camera, config) if camera.name in images else blank for camera in rig]
     return np.stack(windows), np.array([camera.name in images for camera in rig])
-
-
-def mirror_rig(rig: Rig) -> Rig:
-    """Return the rig that sees the world mirrored at the x axis through horizontally flipped images.
-
-    Training flips images and negates y of the truth, and hands the network the calibration of this rig.
-    """
-    mirror = np.diag([1.0, -1.0, 1.0])
-    flip = np.diag([-1.0, 1.0, 1.0])
-    cameras = []
-    for camera in rig:
-        pose = camera.camera_to_ego.copy()
-        pose[:3, :3] = mirror @ pose[:3, :3] @ flip
-        pose[:3, 3] = mirror @ pose[:3, 3]
-        intrinsics = camera.intrinsics.copy()
-        intrinsics[0, 2] = camera.width - intrinsics[0, 2]
-        cameras.append(replace(camera, intrinsics=intrinsics, camera_to_ego=pose))
-    return tuple(cameras)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -18,7 +18,6 @@ from torch import Tensor
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.batches import prefetch
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, learning_rate, make_optimiser
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import Budget, Report, TrainingSettings
@@ -43,8 +42,8 @@ class Stage(Protocol[Data]):
         """Get ready; the network has the weights that the stage starts from."""
         ...
 
-    def make_batch(self, step: int) -> Data:
-        """Return the data of one step; called in a thread that works ahead, step after step."""
+    def batches(self, first: int) -> Iterator[Data]:
+        """Yield the data of one step after the other."""
         ...
 
     def losses(self, step: int, batch: Data) -> dict[str, Tensor]:
@@ -144,8 +143,8 @@ class Trainer:
         cpu_before = position.cpu_seconds
         last_saved = last_validated = position.seconds
         meter = _Meter()
-        with self._signals(), closing(_steps(stage, position.step)) as steps:
-            for step, batch in steps:
+        with self._signals():
+            for step, batch in enumerate(stage.batches(position.step), position.step):
                 terms = stage.losses(step, batch)
                 loss = torch.stack(list(terms.values())).sum()
                 optimiser.zero_grad(set_to_none=True)
@@ -273,15 +272,6 @@ class Trainer:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-
-
-def _steps(stage: Stage[Data], first: int) -> Generator[tuple[int, Data]]:
-    """Yield steps and their batches, prepared ahead."""
-    with closing(prefetch(stage.make_batch, first)) as batches:
-        step = first
-        for batch in batches:
-            yield step, batch
-            step += 1
 
 
 class _Meter:

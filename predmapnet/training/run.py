@@ -16,9 +16,9 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import load_config
 from predmapnet.training import run_checkpoint
 from predmapnet.training.clips import ClipTraining
-from predmapnet.training.data.batches import TrainingScenes
-from predmapnet.training.data.fill_cache import DEMO, cache_folder, fill_demo_cache
-from predmapnet.training.data.scene_cache import read_cached_scene
+from predmapnet.training.data.draws import TrainingScenes
+from predmapnet.training.data.prepare import DataOptions, prepare_data
+from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import CLIP_STAGES, Report, TrainingSettings
@@ -30,6 +30,8 @@ from predmapnet.weights.files import weights_hash
 from predmapnet.weights.inspection import parts_of
 
 WEIGHTS = "weights.safetensors"
+Data = tuple[TrainingScenes, list[CachedScene]]
+"""What is trained on, and what is validated on."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,8 @@ class RunOptions:
 
     Attributes:
         config: of the network.
-        data: ``demo``.
+        data: what it learns from.
         folder: where checkpoints, metrics and weights go.
-        cache: folder of the training caches.
-        towns: number of training scenes.
-        validation_towns: number of validation scenes.
         processes: training processes that share every step.
         threads: of each process.
         settings: how it trains.
@@ -52,11 +51,8 @@ class RunOptions:
     """
 
     config: PredMapNetConfig
-    data: str
+    data: DataOptions
     folder: Path
-    cache: Path
-    towns: int
-    validation_towns: int
     processes: int
     threads: int
     settings: TrainingSettings
@@ -77,20 +73,19 @@ def train_network(options: RunOptions, report: Report = print) -> Path | None:
     _check_device(options)
     _check_folder(options)
     _check_beginning(options)
-    fill_demo_cache(_cache(options), _names(options, "train"), options.config, options.processes, report)
-    fill_demo_cache(_cache(options), _names(options, "val"), options.config, options.processes, report)
+    data = prepare_data(options.data, options.config, options.processes, report)
     meeting_point = options.folder / f".meeting-{os.getpid()}"
     options.folder.mkdir(parents=True, exist_ok=True)
     meeting_point.unlink(missing_ok=True)
     context = multiprocessing.get_context("spawn")
     others = [
-        context.Process(target=_other_process, args=(options, rank, meeting_point), daemon=True)
+        context.Process(target=_other_process, args=(options, data, rank, meeting_point), daemon=True)
         for rank in range(1, options.processes)
     ]
     for process in others:
         process.start()
     try:
-        finished = _train_process(options, ProcessGroup(0, options.processes), meeting_point, report)
+        finished = _train_process(options, data, ProcessGroup(0, options.processes), meeting_point, report)
         for process in others:
             process.join()
     finally:
@@ -112,7 +107,7 @@ def export(options: RunOptions) -> Path:
     run_checkpoint.load_weights(network, average, newest)
     position = run_checkpoint.read_json(newest / "position.json")
     facts = {name: position[name] for name in ("frames", "finished", "cpu_seconds")}
-    facts |= {"data": options.data, "towns": options.towns, "seed": options.settings.seed}
+    facts |= {"data": str(options.data), "towns": options.data.towns, "seed": options.settings.seed}
     if options.initial is not None:
         facts["initial_sha256"] = weights_hash(options.initial)
     path = options.folder / WEIGHTS
@@ -120,23 +115,25 @@ def export(options: RunOptions) -> Path:
     return path
 
 
-def _other_process(options: RunOptions, rank: int, meeting_point: Path) -> None:
+def _other_process(options: RunOptions, data: Data, rank: int, meeting_point: Path) -> None:
     """Body of every process but the first; it says nothing."""
     end_with_parent()
-    _train_process(options, ProcessGroup(rank, options.processes), meeting_point, lambda _line: None)
+    _train_process(options, data, ProcessGroup(rank, options.processes), meeting_point, lambda _line: None)
 
 
-def _train_process(options: RunOptions, processes: ProcessGroup, meeting_point: Path, report: Report) -> bool:
+def _train_process(
+    options: RunOptions, data: Data, processes: ProcessGroup, meeting_point: Path, report: Report
+) -> bool:
     """Run all stages in one process; return whether they were finished."""
     torch.set_num_threads(options.threads)
     processes.join(meeting_point)
     try:
-        return _run_stages(options, processes, report)
+        return _run_stages(options, data, processes, report)
     finally:
         processes.leave()
 
 
-def _run_stages(options: RunOptions, processes: ProcessGroup, report: Report) -> bool:
+def _run_stages(options: RunOptions, data: Data, processes: ProcessGroup, report: Report) -> bool:
     settings = options.settings
     torch.manual_seed(settings.seed)
     network = PredMapNet(options.config)
@@ -148,12 +145,7 @@ def _run_stages(options: RunOptions, processes: ProcessGroup, report: Report) ->
     trainer = Trainer(network, settings, options.folder, processes, report)
     if options.resume:
         trainer.resume()
-    scenes = TrainingScenes(
-        [read_cached_scene(_cache(options) / name) for name in _names(options, "train")], options.config
-    )
-    validation = (
-        [read_cached_scene(_cache(options) / name) for name in _names(options, "val")] if processes.leads else []
-    )
+    scenes, validation = data
 
     def measure(average: PredMapNet, stage: str) -> dict[str, float]:
         return validate(average, validation, streaming=stage != SingleFrameStage.name)
@@ -213,27 +205,6 @@ def _check_beginning(options: RunOptions) -> None:
         )
     elif options.initial is not None:
         run_checkpoint.check_fit(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
-
-
-def _cache(options: RunOptions) -> Path:
-    return cache_folder(options.cache, options.data, options.config)
-
-
-def _names(options: RunOptions, split: str) -> list[str]:
-    """Names of the scenes of one split that this run uses."""
-    from predmapnet.demo_world.catalogue import scene_infos
-
-    names = [info.name for info in scene_infos(split)]
-    wanted = options.towns if split == "train" else options.validation_towns
-    if wanted > len(names):
-        raise UserError(f"The demo world has {len(names)} {split} scenes, not {wanted}.")
-    return names[:wanted]
-
-
-def check_data(data: str) -> None:
-    """Raise UserError for a data set that cannot be trained on yet."""
-    if data != DEMO:
-        raise UserError(f"There is no training data '{data}'. Choose: {DEMO}.")
 
 
 def configuration(preset: str) -> PredMapNetConfig:

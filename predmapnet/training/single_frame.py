@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,8 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
-from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.data.batches import Batch
+from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips, TrainingScenes, step_loader
 from predmapnet.training.losses.lite import frame_losses
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import TrainingSettings
@@ -47,14 +50,14 @@ class SingleFrameStage:
         self._network = network
         self._settings = settings
         self._size = roi_size(network.config).to(network.device)
-        self.make_batch = SingleFrameBatches(
-            scenes,
-            self.frames_per_step,
-            network.config.roi,
-            network.config.decoder.points,
-            settings.augmentation,
-            (settings.seed, processes.rank),
-        )
+        self._frames = Clips(scenes, settings.augmentation, (settings.seed, 1), crossing_weight=CROSSING_WEIGHT)
+        self._processes = processes
+
+    def batches(self, first: int) -> Iterator[Batch]:
+        """Yield the frames of one step after the other."""
+        rank, size = self._processes.rank, self._processes.size
+        for segment in step_loader(self._frames, self.frames_per_step * size, first, rank, size):
+            yield segment.instants[0]
 
     def begin(self) -> None:
         """Train everything."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from hashlib import sha256
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +15,17 @@ from torch import Tensor
 from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
-from predmapnet.network.calibration import collate_calibrations
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, StreamState
+from predmapnet.network.state import BevFeatures, FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
-from predmapnet.training.data.batches import TrainingScenes
-from predmapnet.training.data.streams import FeatureStore, StreamPlan, StreamSegment, StreamSegments
+from predmapnet.training.data.batches import StreamSegment, collate_frames
+from predmapnet.training.data.draws import TrainingScenes
+from predmapnet.training.data.streams import FeatureStore, Streams
 from predmapnet.training.data.targets import Targets
 from predmapnet.training.losses.lite import forecast_loss, forecast_point_loss, frame_losses
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import TrainingSettings
-from predmapnet.training.single_frame import roi_size
+from predmapnet.training.single_frame import frame_inputs, roi_size
 from predmapnet.training.track_truth import Chosen, TrackTruth, choose_tracks, truth_of_tracks
 
 ENCODE_BATCH = 4
@@ -59,10 +59,9 @@ class TemporalStage:
         self._processes = processes
         self._report = report
         self._size = roi_size(network.config).to(network.device)
-        self._plan = StreamPlan.start(settings.streams.streams)
         self._state = network.initial_state(settings.streams.streams)
         self._track_truth = TrackTruth.none(settings.streams.streams, network.device)
-        self._segments: StreamSegments | None = None
+        self._segments: Streams | None = None
 
     def begin(self) -> None:
         """Freeze what makes BEV features and compute those of all frames once."""
@@ -79,28 +78,36 @@ class TemporalStage:
         store = FeatureStore(self._folder / self._fingerprint(), shapes)
         self._fill(store)
         self._processes.wait()
-        seed = (self._settings.seed, self._processes.rank, 1)
-        self._segments = StreamSegments(
-            self._scenes, store, self._settings.streams, config.roi, config.decoder.points, seed
+        settings, processes = self._settings, self._processes
+        self._segments = Streams(
+            self._scenes,
+            store,
+            settings.streams,
+            settings.augmentation,
+            (settings.seed, 2),
+            processes.rank,
+            processes.size,
         )
-        self._segments.plan = self._plan
 
-    def make_batch(self, step: int) -> StreamSegment:
-        """Return the next frames of all streams."""
+    def batches(self, first: int) -> Iterator[StreamSegment]:
+        """Yield the next frames of all streams, step after step."""
         assert self._segments is not None, "begin() comes first"
-        return self._segments(step)
+        return map(self._segments.__getitem__, count(first))
 
     def losses(self, step: int, batch: StreamSegment) -> dict[str, Tensor]:
         """Return the weighted losses of the next frames, mean over frames, and carry the state on."""
         settings = self._settings.streams
         generator = np.random.default_rng([self._settings.seed, self._processes.rank, 2, step])
         forgetful = torch.from_numpy(generator.random(settings.streams) < settings.state_dropout)
-        batch = batch.to(self._network.device)
-        state = forget(self._state, batch.fresh | forgetful.to(batch.fresh.device))
+        device = self._network.device
+        assert batch.fresh is not None and batch.after is not None
+        instants = [instant.to(device) for instant in batch.instants]
+        state = forget(self._state, (batch.fresh | forgetful).to(device))
         track_truth = self._track_truth
         terms: dict[str, Tensor] = {}
-        following = [instant.targets for instant in batch.instants[1:]] + [batch.after]
-        for instant, features, coming in zip(batch.instants, batch.features, following, strict=True):
+        following = [instant.targets for instant in instants[1:]] + [batch.after.to(device)]
+        for instant, stored, coming in zip(instants, batch.features, following, strict=True):
+            features = BevFeatures([level.to(device) for level in stored.levels])
             inputs = FrameInputs(instant.images, instant.camera_valid, instant.ego_to_global, instant.calibration)
             outputs = self._network.decode_bev(features, inputs, state)
             rows = state.instances.valid.shape[1]
@@ -119,7 +126,7 @@ class TemporalStage:
             for name, term in found.terms.items():
                 share = term / len(batch.instants)
                 terms[name] = terms[name] + share if name in terms else share
-        self._state, self._track_truth, self._plan = detached(state), track_truth, batch.plan
+        self._state, self._track_truth = detached(state), track_truth
         return terms
 
     def _forecast(self, state: StreamState, chosen: Chosen, coming: Targets) -> Tensor:
@@ -134,9 +141,8 @@ class TemporalStage:
         return self._settings.weights.forecast * loss / max(len(pairs), 1)
 
     def state(self) -> dict[str, Tensor]:
-        """Return plan, state and true elements of the streams."""
-        tensors = {f"plan.{name}": value for name, value in self._plan.tensors().items()}
-        tensors |= {f"owners.{name}": value for name, value in vars(self._track_truth).items()}
+        """Return state and true elements of the streams."""
+        tensors = {f"owners.{name}": value for name, value in vars(self._track_truth).items()}
         return tensors | {f"state.{name}": value for name, value in self._state.tensors().items()}
 
     def restore(self, tensors: dict[str, Tensor]) -> None:
@@ -145,13 +151,10 @@ class TemporalStage:
         def part(prefix: str) -> dict[str, Tensor]:
             return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
-        self._plan = StreamPlan(**{name: value.numpy() for name, value in part("plan.").items()})
         tensors = {name: value.to(self._network.device) for name, value in tensors.items()}
         if "state.frame" in tensors:
             self._track_truth = TrackTruth(**part("owners."))
             self._state = StreamState.from_tensors(part("state."))
-        if self._segments is not None:
-            self._segments.plan = self._plan
 
     def _fingerprint(self) -> str:
         """Name of the frozen weights, so that features of others are never mixed in."""
@@ -169,18 +172,14 @@ class TemporalStage:
         missing = [index for index in range(len(self._scenes.scenes)) if not store.has(index)]
         for done, scene in enumerate(mine := missing[self._processes.rank :: self._processes.size]):
             frames = len(self._scenes.scenes[scene])
-            with store.writing(scene, frames) as values:
-                for start in range(0, frames, ENCODE_BATCH):
-                    stop = min(start + ENCODE_BATCH, frames)
-                    loaded = [self._scenes.load(scene, frame, store.mirrored(scene)) for frame in range(start, stop)]
-                    images = torch.from_numpy(np.stack([frame.images for frame in loaded])).to(self._network.device)
-                    normalised = normalise_images(images, self._network.config.image)
-                    valid = torch.ones(images.shape[:2], dtype=torch.bool, device=images.device)
-                    anywhere = torch.zeros(stop - start, 4, 4, dtype=torch.float64, device=images.device)
-                    calibration = collate_calibrations([frame.calibration for frame in loaded]).to(images.device)
-                    inputs = FrameInputs(normalised, valid, anywhere, calibration)
-                    features = self._network.encode_bev(self._network.encode_images(inputs), inputs)
-                    values[start:stop] = store.pack(features)
+            features = []
+            for start in range(0, frames, ENCODE_BATCH):
+                numbers = range(start, min(start + ENCODE_BATCH, frames))
+                loaded = [self._scenes.load(scene, frame, store.mirrored(scene)) for frame in numbers]
+                batch = collate_frames(loaded, self._network.config).to(self._network.device)
+                inputs = frame_inputs(batch, self._network.config)
+                features.append(self._network.encode_bev(self._network.encode_images(inputs), inputs))
+            store.write(scene, features)
             if self._processes.leads and done % 10 == 9:
                 self._report(f"BEV features: {done + 1}/{len(mine)} scenes of this process")
 

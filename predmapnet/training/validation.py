@@ -12,12 +12,11 @@ from mapfusion.elements import FrameMap
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
-from predmapnet.network.calibration import Calibration, calibrate
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
-from predmapnet.training.data.scene_cache import CachedScene
+from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 
 Float = NDArray[np.float64]
 
@@ -47,7 +46,7 @@ def validate(network: PredMapNet, scenes: Sequence[CachedScene], streaming: bool
         indices = range(len(scene)) if streaming else measured
         maps = map_frames(network, scene, indices, streaming)
         frames += [
-            EvaluationFrame(scene.name, index, predicted, scene.truths[index])
+            EvaluationFrame(scene.name, index, predicted, scene.frame(index, images=False).truth)
             for index, predicted in zip(indices, maps, strict=True)
             if index in measured
         ]
@@ -73,23 +72,25 @@ def map_frames(network: PredMapNet, scene: CachedScene, indices: Iterable[int], 
     config = network.config
     empty = network.initial_state(1)
     state = empty
-    calibration = calibrate(scene.rig, config).to(network.device)
-    geometry = network.view_geometry(calibration)
+    known, geometry = b"", None
     for index in indices:
-        inputs = _inputs(scene, index, network, calibration)
+        frame = scene.frame(index)
+        inputs = _inputs(frame, network)
+        if (cameras := frame.calibration.fingerprint()) != known:
+            known, geometry = cameras, network.view_geometry(inputs.calibration)
         outputs = network(inputs, state, geometry)
         selection = select(outputs, state, config)
         after = network.advance(state, outputs, selection.instances, inputs, selection.lost)
-        pose = scene.ego_to_global[index]
+        pose = inputs.ego_to_global[0].cpu().numpy()
         yield to_frame_map(selection, after, outputs.segmentation, config, index * FRAME_INTERVAL_NS, pose)
         state = after if streaming else empty
 
 
-def _inputs(scene: CachedScene, index: int, network: PredMapNet, calibration: Calibration) -> FrameInputs:
-    images = torch.from_numpy(np.array(scene.images[index]))[None].to(network.device)
+def _inputs(frame: CachedFrame, network: PredMapNet) -> FrameInputs:
+    device = network.device
     return FrameInputs(
-        images=normalise_images(images, network.config.image),
-        camera_valid=torch.ones(images.shape[:2], dtype=torch.bool, device=network.device),
-        ego_to_global=torch.from_numpy(scene.ego_to_global[index])[None].to(network.device),
-        calibration=calibration,
+        images=normalise_images(torch.from_numpy(frame.images)[None].to(device), network.config.image),
+        camera_valid=torch.from_numpy(frame.camera_valid)[None].to(device),
+        ego_to_global=torch.from_numpy(frame.ego_to_global)[None].to(device),
+        calibration=frame.calibration.to(device),
     )

@@ -11,13 +11,14 @@ import contextlib
 import hashlib
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from mapfusion import geometry
 from mapfusion.arrays import Float
@@ -112,26 +113,35 @@ def cached_truths(folder: Path, key: str, compute: Callable[[], Sequence[FrameTr
     return truths
 
 
-def _save(path: Path, truths: Sequence[FrameTruth]) -> None:
+def truth_arrays(truths: Sequence[FrameTruth]) -> dict[str, NDArray[np.generic]]:
+    """Return the truth of many frames as few arrays, for a file of numpy's."""
     lines = [line for truth in truths for line in truth.polylines]
-    arrays = {
+    return {
         "counts": np.array([len(truth.polylines) for truth in truths], dtype=np.int64),
         "lengths": np.array([len(line) for line in lines], dtype=np.int64),
         "points": np.concatenate([np.zeros((0, 2)), *lines]),
         "kinds": np.concatenate([np.zeros(0, dtype=np.int64), *(truth.kinds for truth in truths)]),
         "element_ids": np.concatenate([np.zeros(0, dtype=np.int64), *(truth.element_ids for truth in truths)]),
     }
+
+
+def truths_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> list[FrameTruth]:
+    """Return what :func:`truth_arrays` was given. Raises KeyError or ValueError for arrays of another kind."""
+    lengths, points = arrays["lengths"], arrays["points"]
+    kinds, element_ids = arrays["kinds"], arrays["element_ids"]
+    lines = np.split(points, np.cumsum(lengths)[:-1]) if len(lengths) else []
+    ends = np.cumsum(arrays["counts"])
+    return [
+        FrameTruth(kinds[end - count : end], tuple(lines[end - count : end]), element_ids[end - count : end])
+        for count, end in zip(arrays["counts"].tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def _save(path: Path, truths: Sequence[FrameTruth]) -> None:
     with write_whole(path) as temporary:
-        np.savez_compressed(temporary, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(temporary, **truth_arrays(truths))  # type: ignore[arg-type]
 
 
 def _load(path: Path) -> list[FrameTruth]:
-    with np.load(path, allow_pickle=False) as arrays:
-        counts, lengths, points = arrays["counts"], arrays["lengths"], arrays["points"]
-        kinds, element_ids = arrays["kinds"], arrays["element_ids"]
-    lines = np.split(points, np.cumsum(lengths)[:-1]) if len(lengths) else []
-    ends = np.cumsum(counts)
-    return [
-        FrameTruth(kinds[end - count : end], tuple(lines[end - count : end]), element_ids[end - count : end])
-        for count, end in zip(counts.tolist(), ends.tolist(), strict=True)
-    ]
+    with np.load(path, allow_pickle=False) as stored:
+        return truths_of_arrays({name: stored[name] for name in stored.files})

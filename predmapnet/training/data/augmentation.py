@@ -1,15 +1,19 @@
-"""Changes to a frame that keep its truth exact: mirroring left and right, photography, missing cameras."""
+"""Changes to a frame that keep its truth exact: mirroring, photography, lost cameras, wrong calibrations and poses."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.calibration_noise import CalibrationNoise
+from mapfusion.arrays import Float
+from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
+from predmapnet.network.image_input import input_size
+from predmapnet.training.data.calibration_noise import CalibrationNoise, perturb_calibration
 from predmapnet.training.data.photography import (
     PhotographySettings,
     add_noise,
@@ -18,12 +22,11 @@ from predmapnet.training.data.photography import (
     save_and_load,
     tone_tables,
 )
-from predmapnet.training.data.scene_cache import Images
-
-Float = NDArray[np.float64]
+from predmapnet.training.data.scene_cache import CachedFrame, Images
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""
+_OTHER_SIDE = {"LEFT": "RIGHT", "RIGHT": "LEFT", "left": "right", "right": "left"}
 
 
 @dataclass(frozen=True)
@@ -33,47 +36,64 @@ class AugmentationSettings:
     Attributes:
         mirror: probability of swapping left and right.
         photography: light, lenses, sensors and files.
-        camera_dropout: probability that one camera of a frame is missing; a single one never is.
-        calibration: how wrong the calibration is that the network is told (single-frame stage).
+        grid_mask: probability that a grid covers a quarter of the images of a frame; MapTracker's is 0.7.
+        camera_dropout: probability that one camera of a frame is missing; the last one never is.
+        calibration: how wrong the calibration is that the network is told.
+        pose_metres, pose_degrees: standard deviation of the places and headings of the frames of a stream.
     """
 
     mirror: float = 0.5
     photography: PhotographySettings = field(default_factory=PhotographySettings)
+    grid_mask: float = 0.0
     camera_dropout: float = 0.05
     calibration: CalibrationNoise = field(default_factory=CalibrationNoise)
+    pose_metres: float = 0.05
+    pose_degrees: float = 0.1
 
 
-def mirror_images(images: Images) -> Images:
-    """Return what the mirrored rig (:func:`predmapnet.network.image_input.mirror_rig`) sees in the mirrored world.
+def mirror(frame: CachedFrame, config: PredMapNetConfig) -> CachedFrame:
+    """Return what a mirrored car sees in the mirrored world: flipped images, and y with another sign."""
+    depth, calibration = frame.depth, frame.calibration
+    if depth is not None:
+        # Cells of the padding at the right stay there.
+        shown = config.image.width * depth.shape[2] // input_size(config.image)[1]
+        depth = np.concatenate([depth[:, :, :shown][:, :, ::-1], depth[:, :, shown:]], axis=2)
+    # The column u of a pixel becomes width - u, before it is divided by the depth.
+    flip = torch.eye(3, dtype=torch.float64).repeat(*calibration.camera_code.shape, 1, 1)
+    flip[..., 0, 0], flip[..., 0, 2] = -1.0, calibration.image_size[..., 0]
+    return replace(
+        frame,
+        ego_to_global=MIRROR_Y @ frame.ego_to_global @ MIRROR_Y,
+        calibration=replace(
+            calibration,
+            ego_to_image=flip @ calibration.ego_to_image @ torch.from_numpy(MIRROR_Y),
+            camera_code=torch.tensor(_mirrored_codes(config))[calibration.camera_code],
+        ),
+        truth=replace(frame.truth, polylines=tuple(line * [1.0, -1.0] for line in frame.truth.polylines)),
+        images=np.ascontiguousarray(frame.images[:, :, ::-1]),
+        depth=depth,
+    )
 
-    Args:
-        images: ``(N, h, w, 3)``.
-    """
-    return np.ascontiguousarray(images[:, :, ::-1])
+
+def _mirrored_codes(config: PredMapNetConfig) -> list[int]:
+    """By learned camera code, that of the camera of the same name at the other side."""
+    names = config.bev.cameras if isinstance(config.bev, BevFormerConfig) else ("",)
+    others = [re.sub("|".join(_OTHER_SIDE), lambda side: _OTHER_SIDE[side[0]], name) for name in names]
+    return [names.index(other) if other in names else code for code, other in enumerate(others)]
 
 
-def mirror_truth(truth: FrameTruth) -> FrameTruth:
-    """Return the truth of the mirrored world: y changes its sign."""
-    return replace(truth, polylines=tuple(line * np.array([1.0, -1.0]) for line in truth.polylines))
-
-
-def mirror_pose(ego_to_global: Float) -> Float:
-    """Return the ego poses ``(..., 4, 4)`` in the mirrored world."""
-    mirrored: Float = MIRROR_Y @ ego_to_global @ MIRROR_Y
-    return mirrored
+def augment(
+    frame: CachedFrame, settings: AugmentationSettings, config: ImageConfig, generator: np.random.Generator, bump: int
+) -> CachedFrame:
+    """Take a frame again; ``bump`` is the seed of the calibration's error, which the frames of a clip share."""
+    images = cover_grid(change_light(frame.images, settings, generator), settings.grid_mask, config, generator)
+    calibration = perturb_calibration(frame.calibration, settings.calibration, np.random.default_rng(bump))
+    valid = drop_camera(frame.camera_valid, settings, generator)
+    return replace(frame, images=images, camera_valid=valid, calibration=calibration)
 
 
 def change_light(images: Images, settings: AugmentationSettings, generator: np.random.Generator) -> Images:
-    """Take the photographs of one frame again, in other light and with other lenses, sensors and files.
-
-    Args:
-        images: ``(N, h, w, 3)``.
-        settings: how strongly they change.
-        generator: source of randomness.
-
-    Returns:
-        New images of the same shape.
-    """
+    """Take the photographs of one frame ``(N, h, w, 3)`` again, in other light and by other lenses and sensors."""
     look = settings.photography
     changed = np.stack([add_stray_light(image, look, generator) for image in images])
     changed = blur(changed, look, generator)
@@ -82,9 +102,39 @@ def change_light(images: Images, settings: AugmentationSettings, generator: np.r
     return save_and_load(add_noise(changed, look, generator), look, generator)
 
 
-def drop_camera(cameras: int, settings: AugmentationSettings, generator: np.random.Generator) -> NDArray[np.bool_]:
-    """Draw which cameras work: ``(cameras,) bool``, at most one is False, and never all."""
-    valid = np.ones(cameras, dtype=np.bool_)
-    if generator.random() < settings.camera_dropout and cameras > 1:
-        valid[generator.integers(cameras)] = False
-    return valid
+def cover_grid(images: Images, probability: float, config: ImageConfig, generator: np.random.Generator) -> Images:
+    """Cover the squares of a grid with the mean colour (GridMask, Chen et al. 2020), alike in all cameras of a frame.
+
+    Half of each period is covered in either direction, as in MapTracker's training: a quarter of the image.
+    """
+    if generator.random() >= probability:
+        return images
+    sizes = images.shape[1:3]
+    period = int(generator.integers(2, min(sizes)))
+    row, column = ((np.arange(n) + generator.integers(period)) % period >= (period + 1) // 2 for n in sizes)
+    colour = np.multiply(config.mean, 255.0) if config.kind == "window" else np.array(config.mean[::-1])
+    covered = images.copy()
+    covered[:, row[:, None] & column] = colour.round()
+    return covered
+
+
+def drop_camera(
+    valid: NDArray[np.bool_], settings: AugmentationSettings, generator: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Return which cameras ``(N,) bool`` still work when one of them may have failed; the last one never does."""
+    working = np.flatnonzero(valid)
+    if generator.random() >= settings.camera_dropout or len(working) < 2:
+        return valid
+    left = valid.copy()
+    left[generator.choice(working)] = False
+    return left
+
+
+def disturb_pose(ego_to_global: Float, settings: AugmentationSettings, generator: np.random.Generator) -> Float:
+    """Return a pose ``(4, 4)`` as a car measures it that does not know exactly where it is."""
+    turn = np.radians(settings.pose_degrees) * generator.standard_normal()
+    wrong = np.eye(4)
+    wrong[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    wrong[:2, 3] = settings.pose_metres * generator.standard_normal(2)
+    measured: Float = ego_to_global @ wrong
+    return measured

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from predmapnet.config import DepthConfig
+from predmapnet.config import DepthConfig, PredMapNetConfig, ResNet50Config
+from predmapnet.network.image_input import input_size, window_camera
+from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
+from predmapnet.network.small.backbone import STRIDE
 from predmapnet.scenes import Camera, Rig
 
 Float = NDArray[np.float64]
@@ -32,6 +35,25 @@ def depth_targets(points: Float, cameras: Rig, stride: int, config: DepthConfig)
         ``(N, ceil(h / stride), ceil(w / stride)) int64``: bin of each cell, or :data:`UNKNOWN`.
     """
     return np.stack([_of_camera(points, camera, stride, config) for camera in cameras])
+
+
+def depth_of_frame(points: Float | None, rig: Rig, config: PredMapNetConfig) -> NDArray[np.signedinteger]:
+    """Return the targets ``(N, h', w')`` of all cells of a network's features; without a sweep all are unknown.
+
+    Args:
+        points: ``(n, 3)``, metres, ego frame, or None.
+        rig: the cameras before preprocessing.
+        config: of the network.
+
+    Returns:
+        As small an integer type as holds the bins.
+    """
+    stride = LEVEL_STRIDES[0] if isinstance(config.backbone, ResNet50Config) else STRIDE
+    cameras = tuple(window_camera(camera, config.image) for camera in rig)
+    seen = depth_targets(np.zeros((0, 3)) if points is None else points, cameras, stride, config.depth)
+    missing = [-(-size // stride) - cells for size, cells in zip(input_size(config.image), seen.shape[1:], strict=True)]
+    whole = np.pad(seen, ((0, 0), (0, missing[0]), (0, missing[1])), constant_values=UNKNOWN)
+    return whole.astype(np.min_scalar_type(-config.depth.bins))
 
 
 def _of_camera(points: Float, camera: Camera, stride: int, config: DepthConfig) -> NDArray[np.int64]:

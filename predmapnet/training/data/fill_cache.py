@@ -1,175 +1,230 @@
-"""Fill the training cache: demo towns, rendered straight at the network's size."""
+"""Fill the training cache: any data set, frame by frame, and demo towns, drawn straight at the network's size."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import replace
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from functools import partial
 from hashlib import sha256
+from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from mapfusion.geometry import inverse_pose
-from predmapnet.config import ImageWindowConfig, LookupBevConfig, PredMapNetConfig
+from mapfusion.elements import ElementKind
+from predmapnet.config import LookupBevConfig, PredMapNetConfig
+from predmapnet.datasets.images import read_image
+from predmapnet.demo_world.catalogue import default_cache
+from predmapnet.demo_world.training_drive import training_drive
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import image_window, window_intrinsics
-from predmapnet.scenes import Camera, Rig
-from predmapnet.training.data.scene_cache import Images, write_cached_scene
+from predmapnet.machine import begin_worker, stop_workers
+from predmapnet.network.calibration import calibrate
+from predmapnet.network.image_input import stack_windows, window_camera
+from predmapnet.scenes import Frame, FrameTruth, Image, Scene, SceneSource
+from predmapnet.training.data.depth_targets import depth_of_frame
+from predmapnet.training.data.scene_cache import (
+    INDEX,
+    JPEG_OPTIONS,
+    CachedScene,
+    encoded_images,
+    frame_arrays,
+    frame_path,
+    read_arrays,
+    write_arrays,
+)
 from predmapnet.training.settings import Report
 
-if TYPE_CHECKING:
-    from predmapnet.demo_world.render.renderer import Renderer
-    from predmapnet.demo_world.render.response import Response
-    from predmapnet.demo_world.street.looks import Light
-    from predmapnet.demo_world.world import World
-
-DEMO = "demo"
-EDGE_SAMPLES = 2
-"""Samples per pixel and direction along the edges of solids."""
-TEXEL = 0.07
-"""Metres of the ground's texture, finer than a pixel of the network sees it beyond 10 m."""
-SCALING_BLUR = 1.0
-"""Standard deviation by which scaling photographs down blurs them, pixels of an image 800 wide."""
+REPORT_SECONDS = 10.0
+BYTES_PER_PIXEL = 0.25
+"""Of the JPEGs: measured on photographs of nuScenes at 480 x 800."""
 
 
-def cache_folder(root: Path, dataset: str, config: PredMapNetConfig) -> Path:
-    """Name the cache of a data set; it depends on what the images and truth depend on.
+class FilledFrame(NamedTuple):
+    """What became of one frame.
 
-    Args:
-        root: folder of all training caches.
-        dataset: its name.
-        config: image size, ROI and whether depth is learned are looked at.
+    Attributes:
+        made: whether it was not there, damaged, or made from something else.
+        size: bytes.
+        cameras: that have an image.
+        masked: that have none.
+        problem: what is wrong with the first image that should be there.
     """
-    if dataset == DEMO:
-        from predmapnet.demo_world.catalogue import WORLD_VERSION
 
-        dataset = f"{DEMO}-v{WORLD_VERSION}"
-    shape = f"{config.image.width}x{config.image.height}"
-    seen = config.image.horizon if isinstance(config.image, ImageWindowConfig) else config.image.kind
-    key = f"{seen} {config.roi_length} {config.roi_width}".encode()
-    lidar = "-lidar" if config.depth.enabled else ""
-    return root / f"{dataset}-{shape}-{sha256(key).hexdigest()[:8]}{lidar}"
+    made: bool
+    size: int
+    cameras: int
+    masked: int
+    problem: str
 
 
-def fill_demo_cache(
-    folder: Path, names: Sequence[str], config: PredMapNetConfig, processes: int, report: Report = print
+def expected_bytes(images: int, config: PredMapNetConfig) -> float:
+    """Return about how many bytes the cache of some images takes."""
+    return images * config.image.width * config.image.height * BYTES_PER_PIXEL
+
+
+def fill_from_source(
+    source: SceneSource, names: Sequence[str], folder: Path, config: PredMapNetConfig, threads: int, report: Report
 ) -> None:
-    """Render the demo scenes that are not in the cache yet.
+    """Bring scenes of a data set into the cache; what is there is checked, and made anew where it is damaged or old.
+
+    Scenes without a map, and frames without any image, are left out, with a line that says so. Threads are enough:
+    decoding, scaling and encoding let go of the interpreter. Ground truth is shared with ``evaluate``.
 
     Args:
-        folder: of :func:`cache_folder`.
-        names: scenes.
+        source: the data set.
+        names: of the scenes.
+        folder: of the data set in the cache.
         config: of the network that is going to be trained.
-        processes: how many render side by side.
+        threads: how many frames are made side by side.
+        report: gets lines for the user.
+    """
+    total = sum(info.frames for info in source.scenes() if info.name in names)
+    done: list[FilledFrame] = []
+    told = time.monotonic()
+    with ThreadPoolExecutor(threads) as pool:
+        for name in names:
+            scene = source.open(name)
+            truths = scene.truths(config.roi, default_cache() / "ground-truth")
+            if truths is None:
+                report(f"{name} has no map to learn from: it is left out.")
+                continue
+            if not done:
+                size = expected_bytes(total * len(scene.rig), config) / 1e9
+                report(
+                    f"The cache of {total} frames of {len(scene.rig)} cameras in {folder} takes about {size:.1f} GB."
+                )
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            before = len(done)
+            for filled in pool.map(partial(cache_frame, folder / name, scene, truths, config), range(len(scene))):
+                done.append(filled)
+                if time.monotonic() - told > REPORT_SECONDS:
+                    told = time.monotonic()
+                    report(f"{source.name}: {len(done)} of {total} frames, {sum(each.made for each in done)} new")
+            kept = [index for index, filled in enumerate(done[before:]) if filled.cameras]
+            write_index(folder / name, kept, truths)
+            if len(kept) < len(scene):
+                report(f"{name}: {len(scene) - len(kept)} frames without any image are left out.")
+    size, made = sum(each.size for each in done) / 1e9, sum(each.made for each in done)
+    report(f"{source.name}: {len(done)} frames in the cache ({size:.2f} GB), {made} of them new.")
+    if masked := sum(each.masked for each in done):
+        problem = next((each.problem for each in done if each.problem), "")
+        report(f"{source.name}: {masked} images cannot be used, their cameras are masked. {problem}")
+
+
+def cache_frame(
+    folder: Path, scene: Scene, truths: Sequence[FrameTruth], config: PredMapNetConfig, index: int
+) -> FilledFrame:
+    """Bring a frame into the cache of its scene, unless it is there, whole, and made from the same."""
+    frame, path = scene.frame(index), frame_path(folder, index)
+    arrays = frame_arrays(frame.ego_to_global, calibrate(frame.rig, config), truths[index])
+    origin, problems = _origin(frame, arrays), list[str]()
+    try:
+        stored = read_arrays(path)
+    except UserError:
+        stored = {}
+    made = not np.array_equal(stored.get("origin", ()), origin)
+    if made:
+        images, problems = _readable_images(frame)
+        windows, valid = stack_windows(images, frame.rig, config.image)
+        stored = {**arrays, **encoded_images(np.rint(windows).astype(np.uint8), valid), "origin": origin}
+        if config.depth.enabled:
+            stored["depth"] = depth_of_frame(scene.lidar(index), frame.rig, config)
+        write_arrays(path, stored)
+    valid = stored["camera_valid"]
+    return FilledFrame(made, path.stat().st_size, valid.sum(), (~valid).sum(), "".join(problems[:1]))
+
+
+def _origin(frame: Frame, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """Digest of what a frame is made from; an image file is known by its name and size."""
+    digest = sha256(repr(JPEG_OPTIONS).encode())
+    for camera in frame.rig:
+        path = frame.images.get(camera.name)
+        file = (path.name, path.stat().st_size) if path is not None and path.is_file() else None
+        digest.update(repr((camera.name, camera.width, camera.height, file)).encode())
+    for name, array in arrays.items():
+        digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(digest.digest(), np.uint8)
+
+
+def _readable_images(frame: Frame) -> tuple[dict[str, Image], list[str]]:
+    """Images by camera, and what is wrong with those that should be there."""
+    images, problems = {}, [str(problem) for problem in frame.missing.values()]
+    for camera in frame.rig:
+        path = frame.images.get(camera.name)
+        try:
+            image = None if path is None else read_image(path)
+        except UserError as error:
+            problems.append(str(error))
+            continue
+        if image is not None and image.shape[:2] == (camera.height, camera.width):
+            images[camera.name] = image
+        elif image is not None:
+            problems.append(f"{path} has not the {camera.width} x {camera.height} pixels of its calibration.")
+    return images, problems
+
+
+def write_index(folder: Path, frames: Sequence[int], truths: Sequence[FrameTruth]) -> None:
+    """Write which frames of a scene can be used; with this, the scene is complete."""
+    crossings = [ElementKind.PED_CROSSING in truths[frame].kinds for frame in frames]
+    index = {"numbers": np.array(frames, np.int64), "with_crossing": np.array(crossings, np.bool_)}
+    write_arrays(folder / INDEX, index)
+
+
+def fill_with_demo(
+    folder: Path, names: Sequence[str], config: PredMapNetConfig, processes: int, report: Report
+) -> None:
+    """Draw the demo scenes that the cache lacks, or has damaged.
+
+    Args:
+        folder: of the demo world in the cache.
+        names: of the scenes.
+        config: of the network that is going to be trained.
+        processes: how many draw side by side.
         report: gets a line per scene.
     """
-    missing = [name for name in names if not (folder / name).exists()]
+    missing = [name for name in names if not _is_whole(folder / name)]
     if not missing:
         return
-    folder.mkdir(parents=True, exist_ok=True)
-    report(f"Rendering {len(missing)} of {len(names)} demo scenes for training into {folder}.")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, initializer=_one_thread) as pool:
+    report(f"Drawing {len(missing)} of {len(names)} demo scenes for training into {folder}.")
+    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=begin_worker, initargs=(1,))
+    try:
         jobs = {pool.submit(cache_demo_scene, folder / name, config): name for name in missing}
-        try:
-            for done, job in enumerate(as_completed(jobs), start=1):
-                job.result()
-                report(f"{done}/{len(missing)} {jobs[job]}")
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for done, job in enumerate(as_completed(jobs), start=1):
+            job.result()
+            report(f"{done}/{len(missing)} {jobs[job]}")
+    finally:
+        stop_workers(pool)
 
 
-def _one_thread() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    cv2.setNumThreads(1)
+def _is_whole(folder: Path) -> bool:
+    try:
+        scene = CachedScene(folder)
+        return all(scene.frame(index) for index in range(len(scene)))
+    except UserError:
+        return False
 
 
 def cache_demo_scene(folder: Path, config: PredMapNetConfig) -> None:
-    """Render one demo scene at the network's size, without JPEGs between.
+    """Draw one demo scene at the network's size.
 
-    Training scenes have a car of their own (:func:`~predmapnet.demo_world.rigs.sample_rig`) where the network takes
-    any rig, and cameras that expose as they like; validation and test scenes have the demo car.
+    Training scenes have a car of their own where the network takes any rig: MapTracker's view transform has learned
+    where its six cameras sit.
 
     Args:
         folder: where to; its name is the scene's.
         config: of the network.
     """
-    from predmapnet.demo_world.catalogue import build_world
-    from predmapnet.demo_world.render.lidar import scan
-    from predmapnet.demo_world.render.renderer import Renderer
-    from predmapnet.demo_world.rig import LIDAR_TO_EGO
-    from predmapnet.demo_world.truth import truth_from_vector_map
-
-    world = build_world(folder.name)
-    rig, response, light = _car_and_light(world, config)
-    lift = np.eye(4)
-    lift[2, 3] = -rig[0].ground_height
-    world = replace(world, trajectory=replace(world.trajectory, ego_to_global=world.trajectory.ego_to_global @ lift))
-    poses = world.trajectory.ego_to_global
-    lidar_to_ego = inverse_pose(lift) @ LIDAR_TO_EGO
-    renderer = Renderer(world, supersampling=EDGE_SAMPLES, response=response, light=light, texel=TEXEL)
-    images = _render(renderer, tuple(window_camera(camera, config) for camera in rig))
-    truth = truth_from_vector_map(world.map)
-    lidar_to_global = poses @ lidar_to_ego
-    truths = [truth.frame(pose, config.roi) for pose in lidar_to_global]
-    # As the nuScenes reader has it: ego axes, origin at the lidar's x and y.
-    shifted = poses.copy()
-    shifted[:, :2, 3] = lidar_to_global[:, :2, 3]
-    ego_to_shifted = np.eye(4)
-    ego_to_shifted[:2, 3] = -lidar_to_ego[:2, 3]
-    rig = tuple(replace(camera, camera_to_ego=ego_to_shifted @ camera.camera_to_ego) for camera in rig)
-    lidar = None
-    if config.depth.enabled:
-        lidar_to_shifted = ego_to_shifted @ lidar_to_ego
-        sweeps = (scan(renderer, frame, lidar_to_ego)[:, :3].astype(np.float64) for frame in range(len(poses)))
-        lidar = [sweep @ lidar_to_shifted[:3, :3].T + lidar_to_shifted[:3, 3] for sweep in sweeps]
-    write_cached_scene(folder, rig, images, shifted, truths, lidar)
-
-
-def _car_and_light(world: World, config: PredMapNetConfig) -> tuple[Rig, Response, Light]:
-    """The cameras of a demo scene, how they expose, and the light of the scene."""
-    from predmapnet.demo_world.catalogue import SPLITS, scene_number
-    from predmapnet.demo_world.render.response import Response, draw_response
-    from predmapnet.demo_world.rig import DEMO_RIG
-    from predmapnet.demo_world.rigs import sample_rig
-    from predmapnet.demo_world.street.looks import harder_light, light_of
-
-    number, light = scene_number(world.name), light_of(world.look, world.seed)
-    rig, response = DEMO_RIG, Response()
-    if number in SPLITS["train"]:
-        # MapTracker's view transform has learned where its six cameras sit.
-        rig = sample_rig(number) if isinstance(config.bev, LookupBevConfig) else DEMO_RIG
-        response, light = draw_response(number), harder_light(light, number)
-    return rig, replace(response, blur=float(np.hypot(response.blur, SCALING_BLUR))), light
-
-
-def _render(renderer: Renderer, cameras: Rig) -> Images:
-    """Draw all frames, ``(n, N, h, w, 3)``."""
-    count = len(renderer.world.trajectory.timestamps)
-    images = np.empty((count, len(cameras), cameras[0].height, cameras[0].width, 3), np.uint8)
-    for frame in range(count):
-        images[frame] = np.stack([drawn.image for drawn in renderer.render_frame(cameras, frame).values()])
-    return images
-
-
-def window_camera(camera: Camera, config: PredMapNetConfig) -> Camera:
-    """Return the camera that takes exactly the network's window of ``camera``, pixel for pixel.
-
-    Raises:
-        UserError: the window leaves the image, so that part of it would have to be black.
-    """
-    window = image_window(camera, config.image)
-    if window.top + config.image.height > window.scaled_height:
-        raise UserError(f"The window of {config.image.height} rows does not fit into {camera.name}.")
-    return replace(
-        camera,
-        width=config.image.width,
-        height=config.image.height,
-        intrinsics=window_intrinsics(camera, config.image),
-    )
+    window = partial(window_camera, config=config.image)
+    any_car = isinstance(config.bev, LookupBevConfig)
+    drive = training_drive(folder.name, window, config.roi, any_car, config.depth.enabled)
+    folder.mkdir(parents=True, exist_ok=True)
+    calibration, everywhere = calibrate(drive.rig, config), np.ones(len(drive.rig), np.bool_)
+    for number, (pose, truth) in enumerate(zip(drive.ego_to_global, drive.truths, strict=True)):
+        arrays = {**frame_arrays(pose, calibration, truth), **encoded_images(drive.images[number], everywhere)}
+        if drive.sweeps is not None:
+            arrays["depth"] = depth_of_frame(drive.sweeps[number], drive.rig, config)
+        write_arrays(frame_path(folder, number), arrays)
+    write_index(folder, range(len(drive.truths)), drive.truths)

@@ -1,120 +1,123 @@
-"""Training cache: scenes as arrays at the network's image size, memory-mapped from disk.
+"""Training cache: frames at the network's image size, a file each, with all that training needs of them.
 
-One scene is one folder: ``images.npy`` after the network's preprocessing, ``frames.npz`` with poses and truth,
-``rig.json``, and ``lidar.npy`` with all sweeps one after the other where a network learns depth. A folder appears
-under its name only when it is complete.
+One scene is one folder. ``000012.npz`` holds the images of a frame as one JPEG, all cameras one below the other, and
+pose, calibration, truth and depth, each with a checksum; ``index.npz`` is written last and says which frames there are.
 """
 
 from __future__ import annotations
 
-import shutil
+import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
+import cv2
 import numpy as np
-import orjson
+import torch
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
+from predmapnet.datasets.ground_truth.cache import truth_arrays, truths_of_arrays
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, FrameTruth, Rig
+from predmapnet.files import write_file
+from predmapnet.network.calibration import Calibration
+from predmapnet.scenes import FrameTruth
 
-Float = NDArray[np.float64]
 Images = NDArray[np.uint8]
 
-LIDAR_FILE = "lidar.npy"
+INDEX = "index.npz"
+JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
 @dataclass(frozen=True)
-class CachedScene:
-    """One scene, ready for training.
+class CachedFrame:
+    """One frame, ready for training.
 
     Attributes:
-        name: of the scene.
-        rig: the cameras as the data set describes them (before preprocessing).
-        images: ``(n, N, h, w, 3) uint8``, RGB, after the network's preprocessing; memory-mapped.
-        ego_to_global: ``(n, 4, 4) float64``.
-        truths: ``n`` times the truth of a frame, clipped to the ROI.
-        lidar: ``n`` sweeps ``(k_i, 3) float32``, metres, ego frame; memory-mapped; None where nobody asked for them.
+        ego_to_global: ``(4, 4) float64``.
+        calibration: of the cameras, as a batch of one.
+        truth: clipped to the region.
+        images: ``(N, h, w, 3) uint8``, RGB, after the network's preprocessing; without cameras where
+            nobody asked for them.
+        camera_valid: ``(N,) bool``, cameras that have an image.
+        depth: ``(N, h', w') int64`` of :func:`~.depth_targets.depth_of_frame`; None where the
+            network learns none.
     """
 
-    name: str
-    rig: Rig
-    images: Images
     ego_to_global: Float
-    truths: tuple[FrameTruth, ...]
-    lidar: tuple[NDArray[np.float32], ...] | None = None
+    calibration: Calibration
+    truth: FrameTruth
+    images: Images
+    camera_valid: NDArray[np.bool_]
+    depth: NDArray[np.int64] | None = None
+
+
+def frame_path(folder: Path, number: int) -> Path:
+    """Where a frame of a scene lies."""
+    return folder / f"{number:06d}.npz"
+
+
+def frame_arrays(ego_to_global: Float, calibration: Calibration, truth: FrameTruth) -> dict[str, NDArray[Any]]:
+    """Return what is stored of a frame besides images and depth."""
+    cameras = {name: value.numpy() for name, value in vars(calibration).items()}
+    return {"ego_to_global": ego_to_global, **cameras, **truth_arrays([truth])}
+
+
+def encoded_images(images: Images, valid: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """Return what is stored of the images ``(N, h, w, 3)`` of a frame and of which cameras have one."""
+    jpeg = cv2.imencode(".jpg", images.reshape(-1, *images.shape[2:])[:, :, ::-1], JPEG_OPTIONS)[1]
+    return {"images": jpeg, "camera_valid": valid}
+
+
+def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    """Write arrays as one file; each has a checksum in it."""
+    with write_file(path) as temporary:
+        np.savez(temporary, **arrays)  # type: ignore[arg-type]
+
+
+def read_arrays(path: Path, without: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file, all but some. Raises UserError for one that is missing or damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files if name not in without}
+    except (OSError, ValueError, EOFError, NotImplementedError, zlib.error, BadZipFile) as error:
+        raise UserError(f"{path} of the training cache is damaged ({error}). Train again: it is made anew.") from None
+
+
+class CachedScene:
+    """One scene of the cache.
+
+    Attributes:
+        folder: where it lies.
+        name: of the scene.
+        with_crossing: ``(n,) bool``, frames that see a crossing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Open a scene. Raises UserError where it is not there or not complete."""
+        index = read_arrays(folder / INDEX)
+        self.folder, self.name = folder, folder.name
+        self.with_crossing, self._numbers = index["with_crossing"], index["numbers"]
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self._numbers)
 
-
-def write_cached_scene(
-    folder: Path,
-    rig: Rig,
-    images: Images,
-    ego_to_global: Float,
-    truths: Sequence[FrameTruth],
-    lidar: Sequence[Float] | None = None,
-) -> None:
-    """Write one scene; the folder appears only when it is complete.
-
-    Args:
-        folder: where to; its name is the scene's.
-        rig: the cameras before preprocessing.
-        images: ``(n, N, h, w, 3) uint8``.
-        ego_to_global: ``(n, 4, 4) float64``.
-        truths: one per frame.
-        lidar: one sweep ``(k, 3)`` per frame, metres, ego frame, or None.
-    """
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    np.save(partial / "images.npy", images)
-    lines = [line for truth in truths for line in truth.polylines]
-    np.savez(
-        partial / "frames.npz",
-        ego_to_global=ego_to_global,
-        pieces=np.array([len(truth.kinds) for truth in truths], dtype=np.int64),
-        kinds=np.concatenate([np.zeros(0, np.int64), *(truth.kinds for truth in truths)]),
-        element_ids=np.concatenate([np.zeros(0, np.int64), *(truth.element_ids for truth in truths)]),
-        vertices=np.array([len(line) for line in lines], dtype=np.int64),
-        points=np.concatenate([np.zeros((0, 2)), *lines]),
-        sweeps=np.array([len(sweep) for sweep in lidar or ()], dtype=np.int64),
-    )
-    if lidar is not None:
-        np.save(partial / LIDAR_FILE, np.concatenate(lidar).astype(np.float32))
-    (partial / "rig.json").write_bytes(
-        orjson.dumps([asdict(camera) for camera in rig], option=orjson.OPT_SERIALIZE_NUMPY)
-    )
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
-
-
-def read_cached_scene(folder: Path) -> CachedScene:
-    """Open one scene of the cache; images stay on disk until they are used.
-
-    Raises:
-        UserError: the folder does not hold what :func:`write_cached_scene` writes.
-    """
-    try:
-        images = np.load(folder / "images.npy", mmap_mode="r")
-        with np.load(folder / "frames.npz") as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        sweeps = np.load(folder / LIDAR_FILE, mmap_mode="r") if (folder / LIDAR_FILE).exists() else None
-        rig = tuple(_camera(entry) for entry in orjson.loads((folder / "rig.json").read_bytes()))
-    except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"{folder} of the training cache is damaged ({error}). Delete it and train again.") from None
-    lines = np.split(arrays["points"], np.cumsum(arrays["vertices"])[:-1]) if len(arrays["vertices"]) else []
-    ends = np.cumsum(arrays["pieces"])
-    truths = tuple(
-        FrameTruth(arrays["kinds"][start:end], tuple(lines[start:end]), arrays["element_ids"][start:end])
-        for start, end in zip(ends - arrays["pieces"], ends, strict=True)
-    )
-    lidar = None if sweeps is None else tuple(np.split(sweeps, np.cumsum(arrays["sweeps"])[:-1]))
-    return CachedScene(folder.name, rig, images, arrays["ego_to_global"], truths, lidar)
-
-
-def _camera(entry: dict[str, object]) -> Camera:
-    matrices = {name: np.array(entry[name], dtype=np.float64) for name in ("intrinsics", "camera_to_ego")}
-    return Camera(**{**entry, **matrices})  # type: ignore[arg-type]
+    def frame(self, index: int, images: bool = True) -> CachedFrame:
+        """Read one frame, its images (and its depth) only where they are asked for. Raises UserError for damage."""
+        path = frame_path(self.folder, int(self._numbers[index]))
+        arrays = read_arrays(path, without=("origin",) if images else ("origin", "images", "camera_valid", "depth"))
+        pixels, valid = np.zeros((0, 0, 0, 3), np.uint8), np.zeros(0, np.bool_)
+        if images:
+            stacked = np.asarray(cv2.imdecode(arrays["images"], cv2.IMREAD_COLOR_RGB), np.uint8)
+            valid = arrays["camera_valid"]
+            pixels = stacked.reshape(len(valid), -1, *stacked.shape[1:])
+        return CachedFrame(
+            ego_to_global=arrays["ego_to_global"],
+            calibration=Calibration(**{each.name: torch.from_numpy(arrays[each.name]) for each in fields(Calibration)}),
+            truth=truths_of_arrays(arrays)[0],
+            images=pixels,
+            camera_valid=valid,
+            depth=arrays["depth"].astype(np.int64) if "depth" in arrays else None,
+        )

@@ -1,92 +1,39 @@
-"""Streams of the temporal stage: consecutive frames that go on from optimiser step to optimiser step."""
+"""Streams: consecutive frames that go on from optimiser step to optimiser step, as BEV features computed once."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch.utils.data import Dataset
 
-from mapfusion.elements import RegionOfInterest
+from predmapnet.files import write_file
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.batches import RASTER_GRID, Batch, LoadedFrame, TrainingScenes
-from predmapnet.training.data.targets import Targets, truth_targets
+from predmapnet.training.data.augmentation import AugmentationSettings, disturb_pose
+from predmapnet.training.data.batches import StreamSegment, collate_frames
+from predmapnet.training.data.draws import EpochOrder, TrainingScenes
+from predmapnet.training.data.scene_cache import CachedFrame
+from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import StreamSettings
 
 NO_TRUTH = FrameTruth(np.zeros(0, np.int64), (), np.zeros(0, np.int64))
 
 
-@dataclass(frozen=True)
-class StreamPlan:
-    """Where each stream stands, as arrays ``(B,) int64``.
-
-    Attributes:
-        scene: index of the scene.
-        frame: next frame.
-        end: first frame after the clip; equal to ``frame`` when the clip is over.
-    """
-
-    scene: NDArray[np.int64]
-    frame: NDArray[np.int64]
-    end: NDArray[np.int64]
-
-    @classmethod
-    def start(cls, streams: int) -> StreamPlan:
-        """Return a plan whose streams all begin a clip next."""
-        return cls(*np.zeros((3, streams), dtype=np.int64))
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the arrays for a checkpoint."""
-        return {name: torch.from_numpy(value.copy()) for name, value in vars(self).items()}
-
-
-@dataclass
-class StreamSegment:
-    """A few consecutive frames of every stream.
-
-    Attributes:
-        instants: the frames, one batch per instant; images are absent, features stand in :attr:`features`.
-        features: BEV features of each instant.
-        fresh: ``(B,) bool``, streams that begin here and must forget what was before.
-        after: truth of the instant after the last one; nothing for streams that end.
-        plan: where the streams stand afterwards.
-    """
-
-    instants: list[Batch]
-    features: list[BevFeatures]
-    fresh: Tensor
-    after: Targets
-    plan: StreamPlan
-
-    def to(self, device: torch.device) -> StreamSegment:
-        """Move every tensor to ``device``."""
-        return StreamSegment(
-            instants=[instant.to(device) for instant in self.instants],
-            features=[BevFeatures([level.to(device) for level in one.levels]) for one in self.features],
-            fresh=self.fresh.to(device),
-            after=self.after.to(device),
-            plan=self.plan,
-        )
-
-
 class FeatureStore:
-    """BEV features of all frames in half precision, one memory-mapped file per scene.
+    """BEV features of all frames in half precision, one file per scene.
 
     Every other scene is stored mirrored, so that both hands of the world are seen.
     """
 
     def __init__(self, folder: Path, shapes: tuple[tuple[int, ...], ...]) -> None:
-        self._folder = folder
-        self._shapes = shapes
-        self._sizes = [int(np.prod(shape)) for shape in shapes]
-        self._open: dict[int, NDArray[np.float16]] = {}
+        """Use a folder, and the shapes ``(C, H, W)`` of the levels."""
+        self._folder, self._shapes = folder, shapes
         folder.mkdir(parents=True, exist_ok=True)
 
     @staticmethod
@@ -98,95 +45,99 @@ class FeatureStore:
         """Whether a scene is complete."""
         return self._path(scene).exists()
 
-    @contextmanager
-    def writing(self, scene: int, frames: int) -> Iterator[NDArray[np.float16]]:
-        """Yield ``(frames, values)`` to fill; the file gets its name when the block succeeds."""
-        partial = self._path(scene).with_suffix(".partial")
-        shape = (frames, sum(self._sizes))
-        values = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float16, shape=shape)
-        yield values
-        values.flush()
-        partial.rename(self._path(scene))
-
-    def pack(self, features: BevFeatures) -> NDArray[np.float16]:
-        """Flatten the features of ``B`` frames to ``(B, values)``."""
-        packed: NDArray[np.float16] = torch.cat([level.flatten(1) for level in features.levels], 1).half().cpu().numpy()
-        return packed
+    def write(self, scene: int, features: Sequence[BevFeatures]) -> None:
+        """Store the features of all frames of a scene, in batches in their order."""
+        rows = [torch.cat([level.flatten(1) for level in each.levels], 1).half().cpu() for each in features]
+        with write_file(self._path(scene)) as temporary:
+            np.save(temporary, torch.cat(rows).numpy())
 
     def read(self, scenes: NDArray[np.int64], frames: NDArray[np.int64]) -> BevFeatures:
         """Return the features of one frame of each of several scenes."""
-        rows = np.stack([self._scene(int(scene))[frame] for scene, frame in zip(scenes, frames, strict=True)])
-        parts = torch.from_numpy(rows).split(self._sizes, 1)
-        levels = [part.float().reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True)]
+        files = (np.load(self._path(int(scene)), mmap_mode="r") for scene in scenes)
+        rows = torch.from_numpy(np.stack([file[frame] for file, frame in zip(files, frames, strict=True)]))
+        parts = rows.float().split([int(np.prod(shape)) for shape in self._shapes], 1)
+        levels = [part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True)]
         return BevFeatures([level.contiguous(memory_format=torch.channels_last) for level in levels])
-
-    def _scene(self, scene: int) -> NDArray[np.float16]:
-        if scene not in self._open:
-            self._open[scene] = np.load(self._path(scene), mmap_mode="r")
-        return self._open[scene]
 
     def _path(self, scene: int) -> Path:
         return self._folder / f"{scene:05d}.npy"
 
 
-class StreamSegments:
-    """Draws clips and cuts them into steps. Must be called step after step, since streams go on."""
+class Streams(Dataset[StreamSegment]):
+    """Drives through scenes, some side by side, cut into steps; scenes come in shuffled epochs.
+
+    Where the streams stand at a step is counted from the first step on, so any step can be the first that is asked for.
+    """
 
     def __init__(
         self,
         scenes: TrainingScenes,
         store: FeatureStore,
         settings: StreamSettings,
-        roi: RegionOfInterest,
-        points: int,
+        augmentation: AugmentationSettings,
         seed: tuple[int, ...],
+        rank: int = 0,
+        size: int = 1,
     ) -> None:
-        self._scenes = scenes
-        self._store = store
-        self._settings = settings
-        self._roi = roi
-        self._points = points
+        """Choose what to draw.
+
+        Args:
+            scenes: to drive through.
+            store: their features.
+            settings: how many streams a process has, and how long they are.
+            augmentation: of the poses.
+            seed: of the run and of the stage.
+            rank, size: which process of how many; each has streams of its own.
+        """
+        self._scenes, self._store, self._settings, self._augmentation = scenes, store, settings, augmentation
         self._seed = seed
-        self.plan = StreamPlan.start(settings.streams)
+        self._own = slice(rank * settings.streams, (rank + 1) * settings.streams)
+        long_enough = np.array([len(scene) >= settings.frames for scene in scenes.scenes])
+        self._order = EpochOrder(np.array(scenes.weights) * long_enough, (*seed, 0))
+        self._begun = 0
+        # Scene, next frame, frame after the drive, and whether it begins here, of all streams at each step so far.
+        self._stands = [np.zeros((4, settings.streams * size), np.int64)]
 
-    def __call__(self, step: int) -> StreamSegment:
+    def __getitem__(self, step: int) -> StreamSegment:
         """Return the next frames of all streams."""
-        plan, fresh = self._renewed(step)
+        while len(self._stands) < step + 2:
+            self._go_on()
+        scenes, frames, ends, fresh = self._stands[step + 1][:, self._own]
         count = self._settings.frames
-        instants = [self._instant(plan, offset) for offset in range(count)]
-        features = [self._store.read(plan.scene, plan.frame + offset) for offset in range(count)]
+        generator = np.random.default_rng([*self._seed, 2, step, self._own.start])
+        instants, features = [], []
+        for offset in range(count):
+            loaded = [self._load(scene, frame + offset) for scene, frame in zip(scenes, frames, strict=True)]
+            poses = [disturb_pose(each.ego_to_global, self._augmentation, generator) for each in loaded]
+            moved = [replace(each, ego_to_global=pose) for each, pose in zip(loaded, poses, strict=True)]
+            instants.append(collate_frames(moved, self._scenes.config))
+            features.append(self._store.read(scenes, frames + offset))
         following = [
-            self._load(int(scene), int(frame) + count).truth if frame + count < end else NO_TRUTH
-            for scene, frame, end in zip(plan.scene, plan.frame, plan.end, strict=True)
+            self._load(scene, frame + count).truth if frame + count < end else NO_TRUTH
+            for scene, frame, end in zip(scenes, frames, ends, strict=True)
         ]
-        self.plan = StreamPlan(plan.scene, plan.frame + count, plan.end)
-        after = truth_targets(following, self._roi, self._points, None)
-        return StreamSegment(instants, features, torch.from_numpy(fresh), after, self.plan)
+        config = self._scenes.config
+        after = truth_targets(following, config.roi, config.decoder.points, None)
+        return StreamSegment(instants, features, torch.from_numpy(fresh > 0), after)
 
-    def _renewed(self, step: int) -> tuple[StreamPlan, NDArray[np.bool_]]:
-        """Begin new clips where the old ones are over."""
-        generator = np.random.default_rng([*self._seed, step])
-        count = self._settings.frames
-        fresh = self.plan.frame + count > self.plan.end
-        scene, frame, end = self.plan.scene.copy(), self.plan.frame.copy(), self.plan.end.copy()
+    def _go_on(self) -> None:
+        """Add where the streams stand a step later; where a drive is over, a new one begins."""
+        count, step = self._settings.frames, len(self._stands) - 1
+        scene, frame, end, _ = self._stands[-1].copy()
+        frame += count if step else 0
+        fresh = frame + count > end
+        generator = np.random.default_rng([*self._seed, 1, step])
+        grown = count + (self._settings.longest - count) * min(1.0, step / self._settings.growth_steps)
         for stream in np.flatnonzero(fresh):
-            scene[stream] = generator.integers(len(self._scenes.scenes))
+            scene[stream] = self._order[self._begun]
             available = len(self._scenes.scenes[scene[stream]])
-            grown = count + (self._settings.longest - count) * min(1.0, step / self._settings.growth_steps)
             length = min(available, int(generator.integers(count, int(grown) + 1)))
             frame[stream] = generator.integers(0, available - length + 1)
             end[stream] = frame[stream] + length
-        return StreamPlan(scene, frame, end), fresh
+            self._begun += 1
+        self._stands.append(np.stack([scene, frame, end, fresh]))
 
-    def _instant(self, plan: StreamPlan, offset: int) -> Batch:
-        loaded = [self._load(int(s), int(f) + offset) for s, f in zip(plan.scene, plan.frame, strict=True)]
-        return Batch(
-            images=torch.zeros((len(loaded), 0, 0, 0, 3), dtype=torch.uint8),
-            camera_valid=torch.ones((len(loaded), 0), dtype=torch.bool),
-            ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
-            calibration=Calibration.empty(len(loaded)),
-            targets=truth_targets([frame.truth for frame in loaded], self._roi, self._points, RASTER_GRID),
-        )
-
-    def _load(self, scene: int, frame: int) -> LoadedFrame:
-        return self._scenes.load(scene, frame, self._store.mirrored(scene), images=False)
+    def _load(self, scene: int, frame: int) -> CachedFrame:
+        """Read a frame without images and without cameras."""
+        loaded = self._scenes.load(scene, frame, self._store.mirrored(scene), images=False)
+        return replace(loaded, calibration=Calibration.empty(1))

@@ -13,8 +13,7 @@ from predmapnet.network.state import BevFeatures
 from predmapnet.network.track_selection import select
 from predmapnet.training.clip_losses import clip_losses
 from predmapnet.training.clips import clip_frame
-from predmapnet.training.data.batches import Batch
-from predmapnet.training.data.streams import StreamPlan, StreamSegment
+from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.targets import Targets
 from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
 from predmapnet.training.process_group import ProcessGroup
@@ -129,16 +128,15 @@ def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
             for width, s in zip(config.bev.widths, (1, 2, 4), strict=True)
         ]
     )
-    plan = StreamPlan.start(STREAMS)
     fresh = torch.tensor([True, False])
-    clip = StreamSegment(frames, [features] * FRAMES, fresh, replace(frames[0].targets), plan)
+    clip = StreamSegment(frames, [features] * FRAMES, fresh, replace(frames[0].targets))
     with pretended_gpu() as gpu:
         gpu.put_network(network)
         stage = TemporalStage(network, None, settings, tmp_path, ProcessGroup())
         for step in range(2):
             terms = stage.losses(step, clip)
         assert all(term.device == gpu.device for term in terms.values())
-        assert all(value.device == gpu.device for name, value in stage.state().items() if not name.startswith("plan"))
+        assert all(value.device == gpu.device for value in stage.state().values())
         assert float(terms["forecast"]) > 0.0, "there were tracks"
         optimise(network, terms, gpu)
 

@@ -8,11 +8,12 @@ import torch
 
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate, collate_calibrations
-from predmapnet.network.image_input import crop_image, image_window, mirror_rig
+from predmapnet.network.image_input import crop_image, image_window
 from predmapnet.network.layers import cell_centres
 from predmapnet.network.small.backbone import STRIDE
 from predmapnet.network.small.ground_lookup import find_on_ground, ground_points, to_ground
 from predmapnet.presets import preset
+from tests.predmapnet.network.mirrored_rig import mirror_rig
 
 CONFIG = preset("lite")
 GRID = (100, 200)

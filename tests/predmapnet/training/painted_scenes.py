@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -11,10 +12,14 @@ from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import clip_line, inverse_pose, resample, transform_points
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.presets import preset
 from predmapnet.scenes import FrameTruth, Rig
-from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene, write_cached_scene
+from predmapnet.training.data.depth_targets import depth_of_frame
+from predmapnet.training.data.draws import TrainingScenes
+from predmapnet.training.data.fill_cache import write_index
+from predmapnet.training.data.scene_cache import CachedScene, frame_arrays, frame_path, write_arrays
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))
 
@@ -47,14 +52,27 @@ def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig
     lines.append((0, corner + np.array([[0, 0], [4, 0], [4, 9], [0, 9], [0, 0]])))
     poses = np.repeat(np.eye(4)[None], frames, 0)
     poses[:, 0, 3] = np.arange(frames) * 3.0
-    truths, images = [], []
-    for pose in poses:
-        truth = _truth(lines, pose, config.roi)
-        truths.append(truth)
-        images.append(_paint(truth, config, rig))
-    sweeps = [generator.uniform([-40, -20, 0], [40, 20, 3], (2000, 3)) for _ in poses] if config.depth.enabled else None
-    write_cached_scene(folder, rig, np.stack(images), poses, truths, sweeps)
-    return read_cached_scene(folder)
+    truths = [_truth(lines, pose, config.roi) for pose in poses]
+    folder.mkdir(parents=True)
+    for number, (pose, truth) in enumerate(zip(poses, truths, strict=True)):
+        # Single bright pixels on black are no photograph: they are kept as they are.
+        pixels = _paint(truth, config, rig).reshape(-1, config.image.width, 3)[:, :, ::-1]
+        arrays = {"images": cv2.imencode(".png", pixels)[1], "camera_valid": np.ones(len(rig), np.bool_)}
+        if config.depth.enabled:
+            sweep = generator.uniform([-40, -20, 0], [40, 20, 3], (2000, 3))
+            arrays["depth"] = depth_of_frame(sweep, rig, config)
+        arrays |= frame_arrays(pose, calibrate(rig, config), truth)
+        write_arrays(frame_path(folder, number), arrays)
+    write_index(folder, range(frames), truths)
+    return CachedScene(folder)
+
+
+def painted_scenes(
+    folder: Path, frames: int, config: PredMapNetConfig, rigs: Sequence[Rig] = (DEMO_RIG, DEMO_RIG)
+) -> TrainingScenes:
+    """Write and open a painted scene for each rig."""
+    scenes = [painted_scene(folder / f"scene-{i}", frames, i, config, rig) for i, rig in enumerate(rigs)]
+    return TrainingScenes(scenes, [1.0] * len(scenes), config)
 
 
 def _truth(lines: list, pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:

@@ -2,19 +2,21 @@
 
 import json
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 import torch
-from painted_scenes import painted_scene
+from painted_scenes import painted_scenes
 from tiny_clips import tiny_paper_config
 
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
-from predmapnet.training.clips import ClipTraining, ImageClips
-from predmapnet.training.data.batches import TrainingScenes
+from predmapnet.training.clips import ClipTraining
+from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.depth_targets import UNKNOWN
+from predmapnet.training.data.draws import Clips, step_loader
 from predmapnet.training.loop import Trainer
 from predmapnet.training.optimiser import make_optimiser
 from predmapnet.training.process_group import ProcessGroup
@@ -26,8 +28,7 @@ SETTINGS = replace(plan_run(CONFIG, "all", 1.0, 1), clips=ClipSettings(frames=2,
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes")
-    return TrainingScenes([painted_scene(folder / f"scene-{seed}", 5, seed, CONFIG) for seed in range(2)], CONFIG)
+    return painted_scenes(tmp_path_factory.mktemp("scenes"), 5, CONFIG)
 
 
 def test_a_run_goes_through_all_stages_and_freezes_what_they_leave(scenes, tmp_path):
@@ -49,17 +50,17 @@ def test_a_run_goes_through_all_stages_and_freezes_what_they_leave(scenes, tmp_p
 
 
 def test_clips_end_with_their_frame_and_repeat_for_a_seed(scenes):
-    settings = replace(SETTINGS, clips=ClipSettings(frames=3, span=4))
-    clips = ImageClips(scenes, CONFIG, settings, 2, (5, 0))
-    first, again = clips(7), clips(7)
-    assert len(first) == 3
-    assert all(torch.equal(one.images, other.images) for one, other in zip(first, again, strict=True))
-    for step in range(6):
-        driven = np.stack([instant.ego_to_global[:, 0, 3].numpy() for instant in clips(step)])
+    clips = Clips(scenes, AugmentationSettings(), (5, 0), frames=3, span=4)
+    (first, *others), again = ([*islice(step_loader(clips, 2, 7), 6)] for _ in range(2))
+    assert len(first.instants) == 3
+    for one, other in zip(first.instants, again[0].instants, strict=True):
+        assert torch.equal(one.images, other.images)
+    for segment in (first, *others):
+        driven = np.stack([instant.ego_to_global[:, 0, 3].numpy() for instant in segment.instants])
         assert (np.diff(driven, axis=0) >= 0).all(), "in time order"
         assert (driven[-1] - driven[0] <= 4 * 3.0 + 1e-9).all(), "within the span; scenes are driven at 3 m per frame"
-    assert first[0].depth.shape == (2, 6, 8, 12)
-    assert (first[0].depth != UNKNOWN).any()
+    assert first.instants[0].depth.shape == (2, 6, 8, 12)
+    assert (first.instants[0].depth != UNKNOWN).any()
 
 
 def test_a_plan_shares_out_the_time_and_refuses_stages_of_other_networks():

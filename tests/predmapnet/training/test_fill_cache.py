@@ -10,9 +10,8 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.catalogue import SPLITS, look_of
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.demo_world.rigs import sample_rig
-from predmapnet.network.image_input import ego_to_image
 from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene, read_cached_scene
+from predmapnet.training.data.scene_cache import CachedScene
 
 
 @pytest.fixture(scope="module")
@@ -27,26 +26,29 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> CachedScene:
     )
     folder = tmp_path_factory.mktemp("cache") / f"scene-{number:04d}"
     cache_demo_scene(folder, PredMapNetConfig())
-    return read_cached_scene(folder)
+    return CachedScene(folder)
 
 
 def _brightness(scene: CachedScene, frame: int, points: np.ndarray) -> np.ndarray:
     """Brightness at points of the road ``(n, 2)``, ego frame, of those near a camera; NaN where none sees them."""
-    ground = np.column_stack([points, np.full(len(points), scene.rig[0].ground_height), np.ones(len(points))])
+    stored = scene.frame(frame)
+    height_of_road = float(stored.calibration.ground_height[0, 0])
+    ground = np.column_stack([points, np.full(len(points), height_of_road), np.ones(len(points))])
     found = np.full(len(points), np.nan)
-    for camera, matrix in enumerate(ego_to_image(scene.rig, PredMapNetConfig().image)):
-        u, v, depth = (ground @ matrix.T)[:, :3].T
+    for matrix, picture in zip(stored.calibration.ego_to_image[0].numpy(), stored.images, strict=True):
+        u, v, depth = (ground @ matrix.T).T
         column, row = np.floor(u / np.maximum(depth, 0.1)), np.floor(v / np.maximum(depth, 0.1))
-        height, width = scene.images.shape[2:4]
+        height, width = picture.shape[:2]
         seen = (depth > 3) & (depth < 14) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        image = scene.images[frame, camera].astype(float).mean(axis=2)
+        image = picture.astype(float).mean(axis=2)
         found[seen] = image[row[seen].astype(int), column[seen].astype(int)]
     return found
 
 
 def test_paint_is_where_rig_and_truth_say(scene: CachedScene) -> None:
     contrast = {0.0: [], 0.7: []}
-    for frame, truth in enumerate(scene.truths):
+    for frame in range(len(scene)):
+        truth = scene.frame(frame, images=False).truth
         for kind, line in zip(truth.kinds, truth.polylines, strict=True):
             if kind != ElementKind.DIVIDER or len(line) < 2:
                 continue
@@ -64,9 +66,12 @@ def test_paint_is_where_rig_and_truth_say(scene: CachedScene) -> None:
 
 def test_training_scenes_keep_their_own_car_and_validation_scenes_the_demo_car(scene: CachedScene) -> None:
     rig = sample_rig(int(scene.name[-4:]))
-    assert [camera.name for camera in scene.rig] == [camera.name for camera in rig]
-    heights = [camera.camera_to_ego[2, 3] for camera in scene.rig]
+    frames = [scene.frame(index) for index in range(len(scene))]
+    heights = [
+        np.linalg.solve(matrix[:, :3], -matrix[:, 3])[2] for matrix in frames[0].calibration.ego_to_image[0].numpy()
+    ]
     np.testing.assert_allclose(heights, [camera.camera_to_ego[2, 3] for camera in rig])
-    np.testing.assert_allclose(scene.ego_to_global[:, 2, 3], -rig[0].ground_height, atol=0.02)
-    assert scene.images.shape == (40, len(rig), 96, 256, 3)
+    np.testing.assert_allclose([frame.ego_to_global[2, 3] for frame in frames], -rig[0].ground_height, atol=0.02)
+    assert {frame.images.shape for frame in frames} == {(len(rig), 96, 256, 3)} and len(frames) == 40
+    assert all(frame.camera_valid.all() for frame in frames)
     assert rig is not DEMO_RIG

@@ -1,11 +1,12 @@
 """Scenes of different cars train together: every frame brings its own cameras."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 import torch
-from painted_scenes import painted_scene, tiny_config
+from painted_scenes import painted_scenes, tiny_config
 from tiny_clips import tiny_paper_config
 
 from predmapnet.config import PredMapNetConfig
@@ -13,8 +14,9 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.clips import ClipTraining
 from predmapnet.training.data.augmentation import AugmentationSettings
-from predmapnet.training.data.batches import Batch, SingleFrameBatches, TrainingScenes
+from predmapnet.training.data.batches import Batch
 from predmapnet.training.data.calibration_noise import CalibrationNoise
+from predmapnet.training.data.draws import Clips, TrainingScenes, step_loader
 from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
@@ -40,9 +42,7 @@ def other_car():
 
 
 def mixed_scenes(folder, config: PredMapNetConfig) -> TrainingScenes:
-    rigs = (DEMO_RIG, other_car(), DEMO_RIG[:1])
-    scenes = [painted_scene(folder / f"scene-{i}", 6, i, config, rig) for i, rig in enumerate(rigs)]
-    return TrainingScenes(scenes, config)
+    return painted_scenes(folder, 6, config, (DEMO_RIG, other_car(), DEMO_RIG[:1]))
 
 
 def share_painted(batch: Batch, config: PredMapNetConfig) -> list[float]:
@@ -69,10 +69,9 @@ def share_painted(batch: Batch, config: PredMapNetConfig) -> list[float]:
 def test_each_frame_of_a_batch_shows_the_truth_where_its_own_cameras_see_it(tmp_path):
     config = tiny_config()
     scenes = mixed_scenes(tmp_path, config)
-    batches = SingleFrameBatches(scenes, 8, config.roi, config.decoder.points, UNCHANGED, (0,))
     cameras = set()
-    for step in range(3):
-        batch = batches(step)
+    for segment in islice(step_loader(Clips(scenes, UNCHANGED, (0,)), 8), 3):
+        batch = segment.instants[0]
         assert batch.images.shape[1] == batch.camera_valid.shape[1] == batch.calibration.camera_code.shape[1]
         cameras |= set(batch.camera_valid.sum(dim=1).tolist())
         assert min(share_painted(batch, config)) > 0.85

@@ -6,13 +6,13 @@ import orjson
 import pytest
 import torch
 
+from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.clips import ClipTraining
-from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import Budget, ClipSettings, plan_run
-from tests.predmapnet.training.painted_scenes import painted_scene
+from tests.predmapnet.training.painted_scenes import painted_scenes
 from tests.predmapnet.training.paper_clips import JOINT, PlainBackbone
 from tests.predmapnet.training.tiny_clips import tiny_paper_config
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    return TrainingScenes([painted_scene(tmp_path_factory.mktemp("scenes") / "scene-0", 5, 0, CONFIG)], CONFIG)
+    return painted_scenes(tmp_path_factory.mktemp("scenes"), 5, CONFIG, (DEMO_RIG,))
 
 
 def run(folder, scenes, resume=False, cut_at=None):
@@ -79,7 +79,7 @@ def test_dropout_draws_other_numbers_for_another_seed(tmp_path, scenes):
         network = PredMapNet(CONFIG)
         network.image_backbone = PlainBackbone(CONFIG.backbone.channels)
         training = ClipTraining(JOINT, network, scenes, SETTINGS, ProcessGroup())
-        batch = training.make_batch(0)
+        batch = next(iter(training.batches(0)))
         torch.manual_seed(seed)
         found.append(float(training.losses(0, batch)["points"].detach()))
     assert found[0] != pytest.approx(found[1], rel=1e-6)

@@ -7,8 +7,8 @@ import torch
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.batches import Batch
-from predmapnet.training.data.streams import NO_TRUTH, StreamPlan, StreamSegment
+from predmapnet.training.data.batches import Batch, StreamSegment
+from predmapnet.training.data.streams import NO_TRUTH
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import StreamSettings, TrainingSettings
@@ -30,7 +30,7 @@ def standing_car(config, offsets, after):
     seen = torch.ones(1, 1, dtype=torch.bool)
     instants = [Batch(torch.zeros(1, 0), seen, pose(), Calibration.empty(1), targets(y)) for y in offsets]
     features = [BevFeatures(bev_levels(config)) for _ in offsets]
-    return StreamSegment(instants, features, torch.zeros(1, dtype=torch.bool), targets(after), StreamPlan.start(1))
+    return StreamSegment(instants, features, torch.zeros(1, dtype=torch.bool), targets(after))
 
 
 @pytest.mark.parametrize(("offsets", "after"), [([3.0], 3.0 + STEP), ([3.0, 3.0 + STEP], None)])

@@ -9,7 +9,7 @@ import torch
 from painted_scenes import painted_scene
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.calibration import calibrate, collate_calibrations
+from predmapnet.network.calibration import collate_calibrations
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
@@ -50,15 +50,16 @@ def painted_clip(folder: Path, config: PredMapNetConfig, frames: int, streams: i
     generator = torch.Generator().manual_seed(0)
     clip = []
     for index in range(frames):
-        images = torch.from_numpy(np.stack([scene.images[index] for scene in scenes]))
+        loaded = [scene.frame(index) for scene in scenes]
+        images = torch.from_numpy(np.stack([frame.images for frame in loaded]))
         inputs = FrameInputs(
             images=normalise_images(images, config.image),
             camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
-            ego_to_global=torch.from_numpy(np.stack([scene.ego_to_global[index] for scene in scenes])),
-            calibration=collate_calibrations([calibrate(scene.rig, config) for scene in scenes]),
+            ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+            calibration=collate_calibrations([frame.calibration for frame in loaded]),
         )
         cells = (streams, images.shape[1], config.image.height // 8, config.image.width // 8)
         depth = torch.randint(-1, config.depth.bins, cells, generator=generator)
-        targets = truth_targets([scene.truths[index] for scene in scenes], config.roi, config.decoder.points, GRID)
+        targets = truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, GRID)
         clip.append(ClipFrame(inputs, targets, depth))
     return clip

@@ -1,0 +1,121 @@
+"""Epochs: everything comes as often as it should, in an order that hangs on nothing but seed and number."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from predmapnet.errors import UserError
+from predmapnet.network.state import BevFeatures
+from predmapnet.training.data.augmentation import AugmentationSettings
+from predmapnet.training.data.draws import Clips, EpochOrder, step_loader
+from predmapnet.training.data.streams import FeatureStore, Streams
+from predmapnet.training.settings import StreamSettings
+from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
+
+CONFIG = tiny_config()
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    return painted_scenes(tmp_path_factory.mktemp("scenes"), 6, CONFIG)
+
+
+@given(st.lists(st.sampled_from([1.0, 2.5, 0.3, 3.0, 0.05]), min_size=4, max_size=60), st.integers(0, 99))
+@settings(deadline=None, max_examples=60)
+def test_each_item_comes_as_often_as_its_weight_says(weights, seed):
+    if sum(weights) < 1:
+        return
+    order = EpochOrder(np.array(weights), (seed,))
+    assert order.draws == pytest.approx(sum(weights), abs=1 + 0.001 * len(weights))
+    for epoch in range(3):
+        drawn = [order[epoch * order.draws + place] for place in range(order.draws)]
+        times = np.bincount(drawn, minlength=len(weights))
+        assert (np.floor(weights) <= times).all() and (times <= np.ceil(weights)).all()
+
+
+def test_over_epochs_a_part_of_a_weight_is_that_part_of_the_draws():
+    order = EpochOrder(np.array([1.0] * 20 + [2.5] * 9), (0,))
+    times = np.bincount([order[draw] for draw in range(200 * order.draws)])
+    np.testing.assert_allclose(times[20:], 500, rtol=0.06)
+
+
+def test_epochs_stages_and_runs_are_shuffled_anew():
+    orders = {
+        tuple(order[epoch * 50 + place] for place in range(50))
+        for order in (EpochOrder(np.ones(50), seed) for seed in ((0, 1), (0, 2), (1, 1)))
+        for epoch in range(3)
+    }
+    assert len(orders) == 9
+    assert all(sorted(order) == list(range(50)) for order in orders)
+
+
+def test_weights_without_a_frame_are_refused():
+    with pytest.raises(UserError, match="epoch"):
+        EpochOrder(np.array([0.1, 0.2]), (0,))
+
+
+def equal_batches(one, other):
+    assert torch.equal(one.images, other.images) and torch.equal(one.camera_valid, other.camera_valid)
+    assert torch.equal(one.calibration.ego_to_image, other.calibration.ego_to_image)
+    assert torch.equal(one.targets.points, other.targets.points)
+
+
+def test_two_processes_see_what_one_would_have_seen_and_a_resumed_run_what_would_have_come(scenes):
+    clips = Clips(scenes, AugmentationSettings(), (3, 1), frames=2, span=3)
+    whole = list(islice(step_loader(clips, 4), 5))
+    halves = [list(islice(step_loader(clips, 4, rank=rank, size=2), 5)) for rank in range(2)]
+    for step, segment in enumerate(whole):
+        for number, instant in enumerate(segment.instants):
+            parts = [half[step].instants[number] for half in halves]
+            assert torch.equal(instant.images, torch.cat([part.images for part in parts]))
+            assert torch.equal(instant.ego_to_global, torch.cat([part.ego_to_global for part in parts]))
+    resumed = next(iter(step_loader(clips, 4, first=3)))
+    equal_batches(resumed.instants[0], whole[3].instants[0])
+    assert not torch.equal(whole[0].instants[0].images, whole[3].instants[0].images)
+
+
+def test_workers_load_the_same(scenes):
+    clips = Clips(scenes, AugmentationSettings(), (3, 1))
+    alone, helped = (list(islice(step_loader(clips, 3, workers=workers), 3)) for workers in (0, 1))
+    for one, other in zip(alone, helped, strict=True):
+        equal_batches(one.instants[0], other.instants[0])
+
+
+def test_the_frames_of_a_clip_are_mirrored_together_and_have_one_wrong_calibration(scenes):
+    clips = Clips(scenes, AugmentationSettings(), (3, 1), frames=3, span=4)
+    mirrored = set()
+    for draw in range(12):
+        frames = clips[draw]
+        for frame in frames[1:]:
+            assert torch.equal(frame.calibration.ego_to_image, frames[0].calibration.ego_to_image)
+        # The car drives straight on along x; a mirrored front left camera looks right.
+        mirrored.add(tuple(float(frame.calibration.ego_to_image[0, 1, 2, 1]) > 0 for frame in frames))
+    assert mirrored == {(True,) * 3, (False,) * 3}
+
+
+def test_streams_go_on_from_step_to_step_and_can_begin_at_any(scenes, tmp_path):
+    store = FeatureStore(tmp_path, ((1, 2, 2),))
+    for scene in range(2):
+        rows = torch.arange(6.0)[:, None, None, None] + 10 * scene
+        store.write(scene, [BevFeatures([rows.expand(6, 1, 2, 2)])])
+    settings = StreamSettings(streams=2, frames=2, longest=6, growth_steps=4)
+    exact = AugmentationSettings(pose_metres=0.0, pose_degrees=0.0)
+    streams = Streams(scenes, store, settings, exact, (0, 2))
+    steps = [streams[step] for step in range(14)]
+    for before, after in zip(steps, steps[1:], strict=False):
+        last, first = (each.features[which].levels[0][:, 0, 0, 0] for each, which in ((before, 1), (after, 0)))
+        for stream in range(2):
+            if not after.fresh[stream]:
+                assert first[stream] == last[stream] + 1
+                assert len(before.after.frame[before.after.frame == stream]) > 0
+    assert 2 < sum(int(each.fresh.sum()) for each in steps) < 28
+    again = Streams(scenes, store, settings, exact, (0, 2))[9]
+    assert torch.equal(again.features[0].levels[0], steps[9].features[0].levels[0])
+    assert torch.equal(again.fresh, steps[9].fresh)
+    two = [Streams(scenes, store, StreamSettings(1, 2, 6, 4), exact, (0, 2), rank, 2)[9] for rank in range(2)]
+    both = torch.cat([each.features[1].levels[0] for each in two])
+    assert torch.equal(both, steps[9].features[1].levels[0])
