@@ -8,10 +8,11 @@ from typing import Annotated
 import typer
 
 from cli.options import Scheme, SplitScheme
+from predmapnet.machine import Precision
 
 
 def train(
-    out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics.jsonl and the weights.")],
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints, metrics and the weights.")] = Path("runs/train"),
     preset: Annotated[str, typer.Option(help="Name of a configuration, or a JSON file of one.")] = "lite",
     data: Annotated[
         list[str] | None,
@@ -29,64 +30,94 @@ def train(
     stage: Annotated[
         str, typer.Option(help="all, or one of: single, temporal (lite); bev, warmup, joint (paper, maptracker).")
     ] = "all",
-    minutes: Annotated[float, typer.Option(min=0.1, help="Time budget, shared out over the stages.")] = 60.0,
-    steps: Annotated[int, typer.Option(min=0, help="Limit of optimiser steps per stage; 0 for none.")] = 0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and stop.")] = False,
+    minutes: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="lite: end after about so long, in good order, instead of after its epochs."),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps of each stage, instead of its epochs.")] = None,
     towns: Annotated[int, typer.Option(min=1, help="Training scenes of the demo world.")] = 160,
     batch: Annotated[
         int | None,
-        typer.Option(min=1, help="Per step, over all processes: frames (lite: 6) or clips (paper, maptracker: 1)."),
+        typer.Option(
+            min=1,
+            help="Frames, clips or streams of a step, over all devices. The learning rate grows with its root.",
+            show_default="lite: 6 and 8; else 1, 6 and 2 a device",
+        ),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, help="Processes that share every step.")] = 2,
-    device: Annotated[str, typer.Option(help="cpu, or cuda with --processes 1.")] = "cpu",
-    threads: Annotated[int, typer.Option(min=1, help="Threads of each process.")] = 1,
+    accumulate: Annotated[
+        int, typer.Option(min=1, help="In how many parts a device takes its share of a batch, to save memory.")
+    ] = 1,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    devices: Annotated[
+        int | None,
+        typer.Option(min=1, help="GPUs, or processes on the CPU.", show_default="all GPUs, or 2"),
+    ] = None,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads of each process.")] = 1,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that load images, for each device.")] = 0,
+    precision: Annotated[
+        Precision, typer.Option(help="Of the image backbone and the BEV encoder.")
+    ] = Precision.FLOAT32,
+    save_memory: Annotated[
+        bool, typer.Option("--save-memory", help="Compute activations again in the backward pass.")
+    ] = False,
     learning_rate: Annotated[
-        float | None,
-        typer.Option(min=1e-6, help="Peak learning rate. Default: 1e-3 in lite's stage single, else 5e-4."),
+        float | None, typer.Option(min=1e-6, help="Its peak, for exactly this batch.", show_default="of the stage")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of weights and draws.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of weights, order, augmentation and dropout.")] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
     init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of the training cache.", show_default=False)] = None,
 ) -> None:
     """Train the network; after an interruption, --resume continues.
 
-    On a shared CPU, one process per core with one thread each is fastest.
+    On a shared CPU, one process per core with one thread each is fastest. Several machines: torchrun.
     """
     import os
 
     os.environ["OMP_NUM_THREADS"] = str(threads)
+    # Otherwise torch warns that all modules had something to do in the first step.
+    os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
+
+    from rich.console import Console
 
     from predmapnet.demo_world.catalogue import default_cache
+    from predmapnet.presets import load_config
     from predmapnet.training import run
     from predmapnet.training.data.prepare import DataOptions, parse_data_sets
-    from predmapnet.training.settings import plan_run, trains_in_clips
+    from predmapnet.training.loop import LoopSettings
+    from predmapnet.training.plan import PlanOptions
+    from predmapnet.training.processes import leads, usual_devices
 
-    config = run.configuration(preset)
+    config = load_config(preset)
     chosen = DataOptions(
         sets=parse_data_sets(data or ["demo"], data_root or []),
         cache=cache or default_cache() / "training",
         towns=towns,
-        validation=2 if trains_in_clips(config) else 10,
+        validation=10,
         split_scheme=split_scheme.value,
     )
     options = run.RunOptions(
         config=config,
         data=chosen,
         folder=out,
-        processes=processes,
+        stage=stage,
+        plan=PlanOptions(devices or usual_devices(device), batch, accumulate, learning_rate, steps, minutes),
+        loop=LoopSettings(seed, precision is Precision.BFLOAT16, save_memory, sync_norms=device != "cpu"),
+        device=device,
         threads=threads,
-        settings=plan_run(config, stage, minutes, steps or None, batch, learning_rate, seed),
+        workers=workers,
         resume=resume,
         initial=init,
-        device=device,
     )
-    typer.echo(
-        f"Training '{preset}' on {chosen} for {minutes:g} minutes (stage {stage}) "
-        f"with {processes} x {threads} threads. Everything goes to {out}."
-    )
+    if dry_run:
+        return Console().print(run.dry_run(options))
     weights = run.train_network(options, typer.echo)
+    if not leads():
+        return None
     if weights is None:
         typer.echo(f"Stopped. Go on with: predmapnet train --out {out} --resume (and the same options)")
         raise typer.Exit(130)
     typer.echo(f"The weights are in {weights}.")
     typer.echo(f"Try them: predmapnet infer scene-0103 --weights {weights} --out map.geojson")
+    return None

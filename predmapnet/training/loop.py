@@ -1,85 +1,69 @@
-"""The training loop: stages, steps, checkpoints, validation, metrics."""
+"""The training loop: steps, checkpoints, validation, metrics. One for all stages, networks and devices."""
 
 from __future__ import annotations
 
+import math
+import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any
+from zlib import crc32
 
-import orjson
 import torch
+import torch.distributed as distributed
+from lightning_fabric import Fabric
 from torch import Tensor
 
 from predmapnet.errors import UserError
+from predmapnet.network.kernels.synced_norm import share_statistics
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
-from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, learning_rate, make_optimiser
-from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.settings import Budget, Report, TrainingSettings
+from predmapnet.training.data.batches import StreamSegment
+from predmapnet.training.instants import StageTraining
+from predmapnet.training.metrics import Meter, MetricsLog
+from predmapnet.training.optimiser import WeightAverage, learning_rate, make_optimiser
+from predmapnet.training.plan import PlannedStage
+from predmapnet.training.run_checkpoint import Position, below_prefix, with_prefix
+from predmapnet.training.settings import Report, Stage
+from predmapnet.training.stage_data import StageData
+from predmapnet.weights.checkpoint import save_checkpoint
+from predmapnet.weights.fit import load_weights
 
-Data = TypeVar("Data")
-Validate = Callable[[PredMapNet, str], dict[str, float]]
-"""Called with the averaged network and the stage's name; returns metrics by name, none where nothing is measured."""
+Validate = Callable[[PredMapNet, Stage], dict[str, float]]
+"""Called in all processes; returns metrics by name, or none."""
 
-
-class Stage(Protocol[Data]):
-    """What the loop needs of a stage.
-
-    Attributes:
-        name: for example ``single`` or ``temporal``.
-        frames_per_step: frames that this process sees in one step.
-    """
-
-    name: str
-    frames_per_step: int
-
-    def begin(self) -> None:
-        """Get ready; the network has the weights that the stage starts from."""
-        ...
-
-    def batches(self, first: int) -> Iterator[Data]:
-        """Yield the data of one step after the other."""
-        ...
-
-    def losses(self, step: int, batch: Data) -> dict[str, Tensor]:
-        """Return the weighted losses, whose sum is minimised."""
-        ...
-
-    def state(self) -> dict[str, Tensor]:
-        """Return what has to survive an interruption."""
-        ...
-
-    def restore(self, tensors: dict[str, Tensor]) -> None:
-        """Continue from what :meth:`state` returned."""
-        ...
+BAD_STEPS = 10
+"""So many steps in a row without a finite gradient end a run."""
+VALIDATIONS = 10
+"""Of each stage."""
+BEST = "best.safetensors"
 
 
-@dataclass
-class Position:
-    """Progress of a run, as checkpoints keep it.
+@dataclass(frozen=True)
+class LoopSettings:
+    """What does not belong to a stage.
 
     Attributes:
-        stage: name of the current stage.
-        step: optimiser steps of this stage so far.
-        frames: frames seen so far, in all stages and processes.
-        seconds: wall time of this stage.
-        total_seconds: wall time of the stages before.
-        cpu_seconds: processor time of all processes and stages.
-        finished: names of the stages that are complete.
+        seed: of weights, order of the data, augmentation and dropout.
+        low_precision: image backbone and BEV encoder compute in bfloat16.
+        save_memory: their activations are computed again in the backward pass.
+        sync_norms: batch norms see the frames of all processes; otherwise only their stored statistics are shared.
+        checkpoint_minutes: interval.
+        log_steps: steps between two lines of metrics.
     """
 
-    stage: str
-    step: int = 0
-    frames: int = 0
-    seconds: float = 0.0
-    total_seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    finished: list[str] = field(default_factory=list)
+    seed: int = 0
+    low_precision: bool = False
+    save_memory: bool = False
+    sync_norms: bool = False
+    checkpoint_minutes: float = 5.0
+    log_steps: int = 20
 
 
 class Trainer:
@@ -87,177 +71,222 @@ class Trainer:
 
     Attributes:
         network: what is trained.
-        average: its moving average, what is validated and shipped (kept up to date by process 0).
+        average: the moving average of its weights, where the stage has one.
         position: where the run stands.
     """
 
     def __init__(
-        self,
-        network: PredMapNet,
-        settings: TrainingSettings,
-        folder: Path,
-        processes: ProcessGroup,
-        report: Report = print,
+        self, fabric: Fabric, network: PredMapNet, folder: Path, settings: LoopSettings, report: Report = print
     ) -> None:
-        self.network = network
-        self.position = Position(stage="")
-        self._settings = settings
-        self._folder = folder
-        self._processes = processes
-        self._report = report
+        self.network, self.position = network, Position()
+        self.average: WeightAverage[PredMapNet] | None = None
+        self._fabric, self._folder, self._settings, self._report = fabric, folder, settings, report
         self._interrupted = False
         self._stored: Path | None = None
-        self.average = WeightAverage(network, settings.optimiser.average_decay)
+        if settings.sync_norms and fabric.world_size > 1:
+            share_statistics(network)
         folder.mkdir(parents=True, exist_ok=True)
+        self._log = MetricsLog(folder, fabric.is_global_zero, report)
+
+    @property
+    def result(self) -> PredMapNet:
+        """The network that is validated and shipped: the average if there is one."""
+        return self.network if self.average is None else self.average.network
 
     def resume(self) -> None:
         """Continue from the newest checkpoint. Raises UserError if there is none."""
         self._stored = run_checkpoint.to_resume(self._folder)
-        stored = run_checkpoint.read_json(self._stored / "position.json")
-        self.average.updates = stored.pop("average_updates")
-        self.position = Position(**stored)
-        tensors = run_checkpoint.read(self._stored, "network")
-        run_checkpoint.load_weights(self.network, run_checkpoint.below_prefix("network", tensors), self._stored)
-        run_checkpoint.load_weights(self.average.network, run_checkpoint.below_prefix("average", tensors), self._stored)
+        self.position = run_checkpoint.read_position(self._stored)
+        self._log.cut(self.position.metrics_bytes)
+        tensors = run_checkpoint.read_tensors(self._stored, "network")
+        load_weights(self.network, below_prefix("network", tensors), self._stored)
+        if average := below_prefix("average", tensors):
+            self.average = WeightAverage(self.network, 0.0)
+            load_weights(self.average.network, average, self._stored)
 
-    def run(
-        self, stage: Stage[Data], budget: Budget, optimiser_settings: OptimiserSettings, validate: Validate
-    ) -> bool:
-        """Train one stage to the end of its budget.
+    def run(self, planned: PlannedStage, data: StageData, validate: Validate) -> bool:
+        """Train one stage to its end.
 
         Args:
-            stage: gives batches and losses.
-            budget: when to end.
-            optimiser_settings: of this stage.
-            validate: measures the averaged network.
+            planned: the stage and its size.
+            data: what this process sees.
+            validate: measures :attr:`result`.
 
         Returns:
             False if a signal ended it early (a checkpoint was written).
+
+        Raises:
+            UserError: ten steps in a row had no finite gradient.
         """
-        if stage.name in self.position.finished:
+        stage, position, settings = planned.stage, self.position, self._settings
+        if stage.name in position.finished:
             return True
-        optimiser = self._enter(stage, optimiser_settings)
-        self.network.train()
-        position, processes = self.position, self._processes
-        start, cpu_start = time.monotonic() - position.seconds, time.process_time()
-        cpu_before = position.cpu_seconds
-        last_saved = last_validated = position.seconds
-        meter = _Meter()
+        training, optimiser = self._begin(stage)
+        module = self._fabric.setup(training)
+        meter, bad, last_saved = Meter(), 0, position.seconds
+        cpu_before, cpu_start, start = position.cpu_seconds, time.process_time(), time.monotonic() - last_saved
+        segments = data.segments(position.step * planned.parts)
         with self._signals():
-            for step, batch in enumerate(stage.batches(position.step), position.step):
-                terms = stage.losses(step, batch)
-                loss = torch.stack(list(terms.values())).sum()
-                optimiser.zero_grad(set_to_none=True)
-                loss.backward()
-                seconds = time.monotonic() - start
-                shared = processes.average_gradients(
-                    self.network,
-                    [
-                        budget.progress(step, seconds),
-                        float(self._interrupted),
-                        float(processes.leads and seconds - last_saved > 60 * self._settings.checkpoint_minutes),
-                        float(processes.leads and seconds - last_validated > 60 * self._settings.validation_minutes),
-                        time.process_time() - cpu_start,
-                    ],
-                )
-                progress, interrupted, save_now, validate_now, cpu_seconds = shared
-                rate = learning_rate(step, progress, optimiser_settings)
-                for group in optimiser.param_groups:
-                    group["lr"] = rate * group["rate"]
-                norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), optimiser_settings.clip_norm)
-                if not torch.isfinite(norm):
-                    raise UserError(f"The loss of step {step} is not finite ({_readable(terms)}). Lower the rate.")
-                optimiser.step()
-                if processes.leads:
-                    self.average.update(self.network)
-                position.step = step + 1
-                position.frames += stage.frames_per_step * processes.size
-                position.seconds = seconds
-                position.cpu_seconds = cpu_before + cpu_seconds * processes.size
-                done = budget.progress(position.step, 0.0) >= 1 or progress >= 1
-                meter.add(terms, float(norm))
-                if processes.leads and (position.step % self._settings.log_steps == 0 or done):
-                    self._log({"lr": rate, **meter.means()}, progress)
-                    meter = _Meter()
-                if validate_now or (done and not interrupted):
-                    last_validated = seconds
-                    if processes.leads:
-                        figures = validate(self.average.network, stage.name)
-                        if figures:
-                            self._log({f"val_{name}": value for name, value in figures.items()}, progress)
+            while parts := list(islice(segments, planned.parts)):
+                seconds, interrupted, cpu = self._agreed(start, cpu_start)
+                position.fall = position.fall or planned.fall(position.step, seconds)
+                fall = (position.fall[0], position.fall[1]) if position.fall else None
+                rate = learning_rate(position.step, fall, planned.rate, stage.optimiser)
+                terms, norm = self._step(module, optimiser, parts, rate, stage)
+                if math.isfinite(norm):
+                    bad = 0
+                    meter.add(terms, torch.tensor(norm, device=self._fabric.device))
+                else:
+                    bad += 1
+                    first = position.step * planned.parts
+                    self._tell_of(training, terms, [data.name(first + i) for i in range(planned.parts)], bad)
+                position.step += 1
+                position.frames += planned.batch * stage.frames
+                position.seconds, position.cpu_seconds = seconds, cpu_before + cpu
+                done = fall is not None and position.step >= fall[1]
+                progress = position.step / fall[1] if fall else seconds / (60 * (planned.minutes or 1))
+                if position.step % settings.log_steps == 0 or done:
+                    self._log.write({"lr": rate, **meter.means(self._mean)}, position, progress)
+                if (done and not interrupted) or int(progress * VALIDATIONS) > position.validated:
+                    position.validated = int(progress * VALIDATIONS)
+                    self._validate(validate, stage, progress)
                 if done and not interrupted:
                     position.finished.append(stage.name)
-                if save_now or interrupted or done:
+                if interrupted or done or seconds - last_saved > 60 * settings.checkpoint_minutes:
                     last_saved = seconds
-                    self._save(stage, optimiser)
+                    self._save(training, optimiser)
                 if interrupted or done:
                     return not interrupted
-        raise AssertionError("the stream of steps never ends by itself")
+        raise AssertionError("the data never ends by itself")
 
-    def _enter(self, stage: Stage[Data], settings: OptimiserSettings) -> torch.optim.Optimizer:
-        """Restore a stage in its middle, or begin it from the averaged weights of the one before."""
-        position = self.position
-        if position.stage == stage.name and self._stored is not None:
-            stage.begin()
-            self.average.decay = settings.average_decay
-            optimiser = make_optimiser(self.network, settings)
-            tensors = run_checkpoint.read(self._stored, "network")
-            run_checkpoint.restore_optimiser(optimiser, run_checkpoint.below_prefix("optimiser", tensors))
-            torch.set_rng_state(tensors["random"])
-            stage.restore(run_checkpoint.read(self._stored, f"stage-{self._processes.rank}"))
+    def _begin(self, stage: Stage) -> tuple[StageTraining, torch.optim.Optimizer]:
+        """Restore a stage in its middle, or begin it from what the one before made."""
+        position, device, settings = self.position, self._fabric.device, self._settings
+        resumed = position.stage == stage.name and self._stored is not None
+        self.network.to(device).train()
+        if not resumed:
+            self.network.load_state_dict(self.result.state_dict())
+            self.average = WeightAverage(self.network, 0.0) if stage.optimiser.average_decay else None
+            position.begin(stage.name)
+        if self.average is not None:
+            self.average.network.to(device)
+            self.average.decay, self.average.updates = stage.optimiser.average_decay, position.average_updates
+        seed, rank = (settings.seed, crc32(stage.name.encode())), self._fabric.global_rank
+        training = StageTraining(self.network, stage, seed, rank).to(device)
+        training.shared = self._mean
+        training.low_precision, training.save_memory = settings.low_precision, settings.save_memory
+        optimiser = make_optimiser(self.network, stage.optimiser)
+        torch.manual_seed(crc32(repr((seed, rank)).encode()))
+        if resumed and self._stored is not None:
+            tensors = run_checkpoint.read_tensors(self._stored, "network")
+            run_checkpoint.restore_optimiser(optimiser, below_prefix("optimiser", tensors))
+            own = run_checkpoint.read_tensors(self._stored, f"rank-{rank}")
+            run_checkpoint.restore_random_states(own, device)
+            training.restore(own)
             self._report(f"Stage {stage.name}: goes on at step {position.step}, frame {position.frames}.")
-            return optimiser
-        self._share_average()
-        self.average = WeightAverage(self.network, settings.average_decay)
-        position.total_seconds += position.seconds
-        position.stage, position.step, position.seconds = stage.name, 0, 0.0
-        self.network.zero_grad(set_to_none=True)
-        stage.begin()
-        return make_optimiser(self.network, settings)
+        return training, optimiser
 
-    def _share_average(self) -> None:
-        """Give every process the averaged weights of process 0."""
-        self.network.load_state_dict(self.average.network.state_dict())
-        self._processes.spread(self.network)
+    def _step(
+        self, module: Any, optimiser: torch.optim.Optimizer, parts: Sequence[StreamSegment], rate: float, stage: Stage
+    ) -> tuple[dict[str, Tensor], float]:
+        """Take one step, unless the gradient is not finite; return the mean losses and the norm of the gradient."""
+        statistics = [value for value in self.network.buffers() if value.is_floating_point()]
+        before = [value.clone() for value in statistics]
+        optimiser.zero_grad(set_to_none=True)
+        means: dict[str, Tensor] = {}
+        for number, part in enumerate(parts):
+            with self._fabric.no_backward_sync(module, enabled=number + 1 < len(parts)):
+                terms: dict[str, Tensor] = module(part, self.position.step, number)
+                self._fabric.backward(torch.stack(list(terms.values())).sum() / len(parts))
+            for name, term in terms.items():
+                means[name] = means.get(name, torch.zeros_like(term)) + term.detach() / len(parts)
+        norm = float(torch.nn.utils.clip_grad_norm_(self.network.parameters(), stage.optimiser.clip_norm))
+        if not math.isfinite(norm):
+            torch._foreach_copy_(statistics, before)
+            return means, norm
+        for group in optimiser.param_groups:
+            group["lr"] = rate * group["rate"]
+        optimiser.step()
+        if statistics and self._fabric.world_size > 1 and not self._settings.sync_norms:
+            shared = self._mean(torch.cat([value.flatten() for value in statistics]))
+            for value, mean in zip(statistics, shared.split([v.numel() for v in statistics]), strict=True):
+                value.copy_(mean.view_as(value))
+        if self.average is not None:
+            self.average.update(self.network)
+            self.position.average_updates = self.average.updates
+        return means, norm
 
-    def _save(self, stage: Stage[Data], optimiser: torch.optim.Optimizer) -> None:
+    def _agreed(self, start: float, cpu_start: float) -> tuple[float, bool, float]:
+        """Return seconds since ``start``, whether to stop, and processor seconds: the same in all processes."""
+        own = [time.monotonic() - start, float(self._interrupted), time.process_time() - cpu_start]
+        if (size := self._fabric.world_size) > 1:
+            latest = torch.tensor(own, dtype=torch.float64, device=self._fabric.device)
+            distributed.all_reduce(latest, distributed.ReduceOp.MAX)
+            own = latest.tolist()
+        return own[0], own[1] > 0, own[2] * size
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """Average a tensor over all processes, in place."""
+        if (size := self._fabric.world_size) > 1:
+            distributed.all_reduce(values)
+            values /= size
+        return values
+
+    def _gathered(self, own: list[str]) -> list[str]:
+        """Return what all processes say."""
+        everyone = [own] * self._fabric.world_size
+        if self._fabric.world_size > 1:
+            distributed.all_gather_object(everyone, own)
+        return [said for each in everyone for said in each]
+
+    def _tell_of(self, training: StageTraining, terms: dict[str, Tensor], names: list[str], bad: int) -> None:
+        """Name the frames of a step that could not be taken. Raises UserError if it is one of many in a row."""
+        training.carried = None  # What streams remember may be broken as well.
+        seen = ", ".join(self._gathered(names))
+        losses = ", ".join(f"{name} {float(term):.3g}" for name, term in terms.items())
+        where = f"step {self.position.step} of stage {self.position.stage}"
+        self._report(f"Skipped {where}, whose gradient is not finite. Losses: {losses}. It saw: {seen}.")
+        if bad >= BAD_STEPS:
+            raise UserError(
+                f"{bad} steps in a row, up to {where}, had no finite gradient. Go on with --resume and a lower "
+                "--learning-rate; if it is always the same frames, look at them."
+            )
+
+    def _validate(self, validate: Validate, stage: Stage, progress: float) -> None:
+        """Measure the network, and keep the best one so far."""
+        network, position = self.result, self.position
+        figures = validate(network.eval(), stage)
+        self.network.train()
+        if not figures:
+            return
+        self._log.write({f"val_{name}": value for name, value in figures.items()}, position, progress)
+        if figures.get("mAP", 0.0) > position.best.get(position.stage, 0.0):
+            position.best[position.stage] = figures["mAP"]
+            if self._fabric.is_global_zero:
+                facts = {"stage": position.stage, "step": position.step, "frames": position.frames, **figures}
+                save_checkpoint(self._folder / BEST, network, facts)
+
+    def _save(self, training: StageTraining, optimiser: torch.optim.Optimizer) -> None:
         """Write a checkpoint, all processes together."""
-        order = len(self.position.finished) * 10_000_000 + self.position.step
-        if self._processes.leads:
-            run_checkpoint.prepare(self._folder, order)
-        self._processes.wait()
-        partial = run_checkpoint.partial_folder(self._folder, order)
-        run_checkpoint.write_tensors(partial / f"stage-{self._processes.rank}.safetensors", stage.state())
-        if self._processes.leads:
-            tensors = {
-                **run_checkpoint.with_prefix("network", self.network.state_dict()),
-                **run_checkpoint.with_prefix("average", self.average.network.state_dict()),
-                **run_checkpoint.with_prefix("optimiser", run_checkpoint.optimiser_tensors(optimiser)),
-                "random": torch.get_rng_state(),
-            }
+        fabric, position = self._fabric, self.position
+        position.metrics_bytes = self._log.size
+        partial = run_checkpoint.partial_folder(self._folder, position)
+        if fabric.is_global_zero:
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+        fabric.barrier()
+        own = run_checkpoint.random_states(fabric.device) | training.tensors()
+        run_checkpoint.write_tensors(partial / f"rank-{fabric.global_rank}.safetensors", own)
+        if fabric.is_global_zero:
+            average = {} if self.average is None else self.average.network.state_dict()
+            tensors = with_prefix("network", self.network.state_dict()) | with_prefix("average", average)
+            tensors |= with_prefix("optimiser", run_checkpoint.optimiser_tensors(optimiser))
             run_checkpoint.write_tensors(partial / "network.safetensors", tensors)
-            stored = {**asdict(self.position), "average_updates": self.average.updates}
-            run_checkpoint.write_json(partial / "position.json", stored)
-        self._processes.wait()
-        if self._processes.leads:
-            self._stored = run_checkpoint.publish(partial)
-
-    def _log(self, values: dict[str, float], progress: float) -> None:
-        """Append one line of metrics and show it."""
-        position = self.position
-        seconds = position.total_seconds + position.seconds
-        line: dict[str, Any] = {
-            "stage": position.stage,
-            "step": position.step,
-            "frames": position.frames,
-            "seconds": round(seconds, 1),
-            "cpu_seconds": round(position.cpu_seconds, 1),
-            **{name: round(value, 5) for name, value in values.items()},
-        }
-        with (self._folder / "metrics.jsonl").open("ab") as file:
-            file.write(orjson.dumps(line) + b"\n")
-        shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
-        self._report(f"{position.stage} {progress:6.1%}  step {position.step}  frames {position.frames}  {shown}")
+        fabric.barrier()
+        if fabric.is_global_zero:
+            run_checkpoint.publish(partial, position)
+        fabric.barrier()
+        self._stored = run_checkpoint.latest(self._folder)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -272,26 +301,3 @@ class Trainer:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-
-
-class _Meter:
-    """Means of the losses since the last line."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, float] = {}
-        self._count = 0
-        self._since = time.monotonic()
-
-    def add(self, terms: dict[str, Tensor], norm: float) -> None:
-        values = {name: float(term.detach()) for name, term in terms.items()}
-        for name, value in {"loss": sum(values.values()), **values, "norm": norm}.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value
-        self._count += 1
-
-    def means(self) -> dict[str, float]:
-        means = {name: total / max(self._count, 1) for name, total in self._sums.items()}
-        return {**means, "seconds_per_step": (time.monotonic() - self._since) / max(self._count, 1)}
-
-
-def _readable(terms: dict[str, Tensor]) -> str:
-    return ", ".join(f"{name} {float(term.detach()):.3g}" for name, term in terms.items())

@@ -1,45 +1,18 @@
-"""AdamW with a schedule over a budget, and the moving average of the weights that is shipped."""
+"""AdamW with its learning rate over steps, and the moving average of the weights that ``lite`` ships."""
 
 from __future__ import annotations
 
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
+
+from predmapnet.training.settings import OptimiserSettings
 
 _Network = TypeVar("_Network", bound=nn.Module)
-
-
-@dataclass(frozen=True)
-class OptimiserSettings:
-    """What drives the weights; the defaults are those of the two-core findings.
-
-    Attributes:
-        learning_rate: its peak.
-        betas, weight_decay: of AdamW.
-        warmup_steps: until the peak is reached, on a line.
-        warmup_start: part of the peak at which the line begins.
-        clip_norm: largest norm of the gradient.
-        decay_all: norms, biases and other single rows are decayed as well.
-        average_decay: of the moving average of the weights; 0 for none, the average is the weights.
-        final_fraction: part of the peak that is left at the end.
-        rates: factors of the rate, by the beginning of the parameters' names; the longest counts, and 1 for others.
-    """
-
-    learning_rate: float = 1e-3
-    betas: tuple[float, float] = (0.9, 0.98)
-    weight_decay: float = 0.02
-    decay_all: bool = False
-    warmup_steps: int = 150
-    warmup_start: float = 0.0
-    clip_norm: float = 10.0
-    average_decay: float = 0.998
-    final_fraction: float = 0.02
-    rates: Mapping[str, float] = field(default_factory=dict)
 
 
 def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.optim.AdamW:
@@ -64,17 +37,22 @@ def _rate_of(name: str, rates: Mapping[str, float]) -> float:
     return rates[max(found, key=len)] if found else 1.0
 
 
-def learning_rate(step: int, progress: float, settings: OptimiserSettings) -> float:
-    """Warm up over steps, then fall along a cosine over the budget.
+def learning_rate(step: int, fall: tuple[int, int] | None, peak: float, settings: OptimiserSettings) -> float:
+    """Warm up on a line, then fall along a cosine.
 
     Args:
         step: optimiser steps of this stage so far.
-        progress: part of the stage's budget (time or steps) that is used up, in [0, 1].
-        settings: peak and warm-up.
+        fall: steps at which the cosine begins and ends; None while that is open.
+        peak: for the whole batch of the run.
+        settings: of the warm-up and of the end.
     """
     warmup = min(1.0, settings.warmup_start + (1 - settings.warmup_start) * (step + 1) / settings.warmup_steps)
-    cosine = 0.5 * (1 + math.cos(math.pi * min(max(progress, 0.0), 1.0)))
-    return settings.learning_rate * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
+    if fall is None:
+        return peak * warmup
+    part = min(max((step - fall[0]) / max(fall[1] - fall[0], 1), 0.0), 1.0)
+    return (
+        peak * warmup * (settings.final_fraction + (1 - settings.final_fraction) * (1 + math.cos(math.pi * part)) / 2)
+    )
 
 
 class WeightAverage(Generic[_Network]):
@@ -97,13 +75,9 @@ class WeightAverage(Generic[_Network]):
         """Move the average towards ``network``; integer buffers are copied."""
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
         self.updates += 1
-        average, current = _floats(self.network), _floats(network)
-        torch._foreach_lerp_(average, current, 1 - decay)
-        for kept, value in zip(self.network.buffers(), network.buffers(), strict=True):
+        pairs = list(zip(self.network.state_dict().values(), network.state_dict().values(), strict=True))
+        moving = [(kept, value) for kept, value in pairs if kept.is_floating_point()]
+        torch._foreach_lerp_([kept for kept, _ in moving], [value for _, value in moving], 1 - decay)
+        for kept, value in pairs:
             if not kept.is_floating_point():
                 kept.copy_(value)
-
-
-def _floats(network: nn.Module) -> list[Tensor]:
-    tensors = [*network.parameters(), *network.buffers()]
-    return [tensor.detach() for tensor in tensors if tensor.is_floating_point()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -12,7 +13,7 @@ from predmapnet.network.state import StreamState
 
 
 def with_pose_noise(
-    state: StreamState, ego_to_global: Tensor, angle: float, distance: float, generator: torch.Generator
+    state: StreamState, ego_to_global: Tensor, angle: float, distance: float, generators: Sequence[torch.Generator]
 ) -> StreamState:
     """Return the state with poses that are wrong as seen from the current frame; maps of the BEV keep theirs.
 
@@ -23,12 +24,12 @@ def with_pose_noise(
         ego_to_global: ``(B, 4, 4) float64``, current.
         angle: deviation of each Euler angle, radians.
         distance: deviation of x and of y, metres.
-        generator: on the CPU.
+        generators: of each stream, on the CPU.
     """
     memory = state.vector_memory
     frames = max(1, int(state.frame.max()))
-    turn, shift = (torch.randn(len(ego_to_global), frames + 1, n, generator=generator) for n in (3, 2))
-    turn, shift = (angle * turn).to(ego_to_global), (distance * shift).to(ego_to_global)
+    drawn = torch.stack([torch.randn(frames + 1, 5, generator=generator) for generator in generators])
+    turn, shift = (angle * drawn[..., :3]).to(ego_to_global), (distance * drawn[..., 3:]).to(ego_to_global)
 
     def wrong(poses: Tensor, turn: Tensor, shift: Tensor, current: Tensor) -> Tensor:
         return (current @ disturb(relative_pose(poses, current), turn, shift)).to(poses.dtype)

@@ -4,18 +4,118 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
 import orjson
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from predmapnet.errors import UserError
 
-CHECKPOINT_PREFIX = "step-"
-_SHOWN_NAMES = 4
+CHECKPOINT_PREFIX = "frames-"
+KEPT = 3
+"""The newest checkpoints that stay; one may turn out to be from after something went wrong."""
+
+
+@dataclass
+class Position:
+    """Progress of a run, as checkpoints keep it.
+
+    Attributes:
+        stage: name of the current stage.
+        step: optimiser steps of this stage so far.
+        fall: steps at which the learning rate begins and ends to fall; empty while that is open.
+        frames: frames seen so far, in all stages and processes.
+        seconds: wall time of this stage.
+        total_seconds: wall time of the stages before.
+        cpu_seconds: processor time of all processes and stages.
+        validated: how many tenths of the stage have been validated.
+        best: of the validations so far, by stage: mAP.
+        finished: names of the stages that are complete.
+        average_updates: of the moving average.
+        metrics_bytes: size of the metrics file.
+    """
+
+    stage: str = ""
+    step: int = 0
+    fall: list[int] = field(default_factory=list)
+    frames: int = 0
+    seconds: float = 0.0
+    total_seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    validated: int = 0
+    best: dict[str, float] = field(default_factory=dict)
+    finished: list[str] = field(default_factory=list)
+    average_updates: int = 0
+    metrics_bytes: int = 0
+
+    def begin(self, stage: str) -> None:
+        """Stand at the beginning of a stage."""
+        self.total_seconds += self.seconds
+        self.stage, self.step, self.validated, self.average_updates = stage, 0, 0, 0
+        self.seconds, self.fall = 0.0, []
+
+
+def partial_folder(folder: Path, position: Position) -> Path:
+    """Return the folder in which the parts of a checkpoint are gathered; names count frames over all stages."""
+    return folder / f".{CHECKPOINT_PREFIX}{position.frames:012d}.partial"
+
+
+def publish(partial: Path, position: Position) -> Path:
+    """Write the position, give a gathered checkpoint its name, and delete all but the newest ones."""
+    (partial / "position.json").write_bytes(orjson.dumps(asdict(position), option=orjson.OPT_INDENT_2))
+    target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
+    shutil.rmtree(target, ignore_errors=True)
+    partial.rename(target)
+    for old in sorted(partial.parent.glob(f"{CHECKPOINT_PREFIX}*"))[:-KEPT]:
+        shutil.rmtree(old)
+    return target
+
+
+def latest(folder: Path) -> Path | None:
+    """Return the newest complete checkpoint below ``folder``, or None."""
+    return max(folder.glob(f"{CHECKPOINT_PREFIX}*"), default=None)
+
+
+def to_resume(folder: Path) -> Path:
+    """Return the newest complete checkpoint below ``folder``. Raises UserError if there is none."""
+    newest = latest(folder)
+    if newest is None:
+        raise UserError(f"There is no checkpoint in {folder} to resume from. Start without --resume.")
+    return newest
+
+
+def read_position(checkpoint: Path) -> Position:
+    """Read where a run stood. Raises UserError if that is damaged."""
+    try:
+        return Position(**orjson.loads((checkpoint / "position.json").read_bytes()))
+    except (OSError, TypeError, orjson.JSONDecodeError) as error:
+        raise UserError(f"The checkpoint {checkpoint} is damaged or of another version: {error}.") from None
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write a safetensors file; tensors that share memory are written apart."""
+    save_file({name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, path)
+
+
+def read_tensors(checkpoint: Path, part: str) -> dict[str, Tensor]:
+    """Read one part (``network``, ``rank-0``) of a checkpoint. Raises UserError if it is damaged."""
+    try:
+        return load_file(checkpoint / f"{part}.safetensors")
+    except Exception as error:
+        raise UserError(f"The checkpoint {checkpoint} is damaged: {part} cannot be read ({error}).") from None
+
+
+def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Put ``prefix.`` before every name."""
+    return {f"{prefix}.{name}": value for name, value in tensors.items()}
+
+
+def below_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose name starts with ``prefix.``, without it."""
+    return {name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")}
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -38,132 +138,14 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Te
         optimiser.state[parameter][slot] = torch.empty_like(like).copy_(value)
 
 
-def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Put ``prefix.`` before every name."""
-    return {f"{prefix}.{name}": value for name, value in tensors.items()}
+def random_states(device: torch.device) -> dict[str, Tensor]:
+    """Return the random states of this process."""
+    states = {"random": torch.get_rng_state()}
+    return states | ({"random_cuda": torch.cuda.get_rng_state(device)} if device.type == "cuda" else {})
 
 
-def below_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors whose name starts with ``prefix.``, without it."""
-    return {name[len(prefix) + 1 :]: value for name, value in tensors.items() if name.startswith(prefix + ".")}
-
-
-def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Write a safetensors file; tensors that share memory are written apart."""
-    save_file({name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}, path)
-
-
-def partial_folder(folder: Path, order: int) -> Path:
-    """Name of the folder in which the parts of a checkpoint are gathered; later ones have a larger ``order``."""
-    return folder / f".{CHECKPOINT_PREFIX}{order:09d}.partial"
-
-
-def prepare(folder: Path, order: int) -> None:
-    """Make that folder, empty."""
-    partial = partial_folder(folder, order)
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-
-
-def publish(partial: Path) -> Path:
-    """Give a gathered checkpoint its name, then delete the older ones."""
-    target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
-    shutil.rmtree(target, ignore_errors=True)
-    partial.rename(target)
-    for older in partial.parent.glob(f"{CHECKPOINT_PREFIX}*"):
-        if older != target:
-            shutil.rmtree(older)
-    return target
-
-
-def latest(folder: Path) -> Path | None:
-    """Return the newest complete checkpoint below ``folder``, or None."""
-    return max(folder.glob(f"{CHECKPOINT_PREFIX}*"), default=None)
-
-
-def to_resume(folder: Path) -> Path:
-    """Return the newest complete checkpoint below ``folder``. Raises UserError if there is none."""
-    newest = latest(folder)
-    if newest is None:
-        raise UserError(f"There is no checkpoint in {folder} to resume from. Start without --resume.")
-    return newest
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write JSON, readable by a person."""
-    path.write_bytes(orjson.dumps(value, option=orjson.OPT_INDENT_2))
-
-
-def read(checkpoint: Path, part: str) -> dict[str, Tensor]:
-    """Read one part (``network``, ``streams-0``) of a checkpoint. Raises UserError if it is damaged."""
-    try:
-        return load_file(checkpoint / f"{part}.safetensors")
-    except Exception as error:
-        raise UserError(f"The checkpoint {checkpoint} is damaged: {part} cannot be read ({error}).") from None
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object. Raises UserError if it is damaged."""
-    try:
-        value: dict[str, Any] = orjson.loads(path.read_bytes())
-    except (OSError, orjson.JSONDecodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}.") from None
-    return value
-
-
-def check_fit(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
-    """Compare weights with the network that they are for; only names and shapes are looked at.
-
-    Args:
-        network: of any device, ``meta`` included.
-        tensors: a state dict.
-        where: its file, for the message.
-
-    Returns:
-        Names of the network that the state dict does not have.
-
-    Raises:
-        UserError: the file has what the network has not, or in another shape.
-    """
-    own = network.state_dict()
-    faults = [
-        name if name not in own else f"{name} {tuple(tensor.shape)} instead of {tuple(own[name].shape)}"
-        for name, tensor in tensors.items()
-        if name not in own or own[name].shape != tensor.shape
-    ]
-    if faults:
-        raise UserError(
-            f"The weights in {where} do not fit the network that is to be trained ({_some(faults)}). "
-            "Choose the --preset that they were made with, or one with more modules on the same baseline."
-        )
-    return [name for name in own if name not in tensors]
-
-
-def start_from(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
-    """Begin a training run with the weights of a network that may have fewer modules switched on.
-
-    Args:
-        network: to be trained.
-        tensors: the state dict to begin with.
-        where: its file, for the message.
-
-    Returns:
-        Names that the file does not fill: they keep their random beginning.
-
-    Raises:
-        UserError: the file has what the network has not, or in another shape.
-    """
-    fresh = check_fit(network, tensors, where)
-    network.load_state_dict(dict(tensors), strict=False)
-    return fresh
-
-
-def load_weights(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> None:
-    """Load a whole state dict; a mismatch (another preset or version) is the user's error."""
-    if absent := check_fit(network, tensors, where):
-        raise UserError(f"The weights in {where} lack some of this network ({_some(absent)}): choose their --preset.")
-    network.load_state_dict(dict(tensors))
-
-
-def _some(names: list[str]) -> str:
-    return f"{len(names)} tensors: {', '.join(names[:_SHOWN_NAMES])}{' ...' if len(names) > _SHOWN_NAMES else ''}"
+def restore_random_states(tensors: Mapping[str, Tensor], device: torch.device) -> None:
+    """Put back what :func:`random_states` returned."""
+    torch.set_rng_state(tensors["random"])
+    if device.type == "cuda":
+        torch.cuda.set_rng_state(tensors["random_cuda"], device)

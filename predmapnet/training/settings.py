@@ -1,4 +1,7 @@
-"""Settings of a training run: stages and their budgets, clips, streams, optimisers."""
+"""The stages of a training as data: the paper's schedule on both data sets, and that of ``lite``.
+
+Where the paper is silent, numbers are MapTracker's.
+"""
 
 from __future__ import annotations
 
@@ -6,137 +9,151 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
+from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig
+from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.training.data.augmentation import AugmentationSettings
-from predmapnet.training.losses.lite import LossWeights
-from predmapnet.training.losses.matching import MatchingCosts
-from predmapnet.training.optimiser import OptimiserSettings
+from predmapnet.training.data.calibration_noise import CalibrationNoise
+from predmapnet.training.losses.weights import LITE_LOSSES, PAPER_LOSSES, LossWeights
 
 Report = Callable[[str], None]
 """Where lines for the user go."""
 
-BEV_PARTS = ("image_backbone", "bev_encoder", "segmentation_head", "depth_head")
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """What drives the weights.
+
+    Attributes:
+        learning_rate: its peak, for the whole batch of the stage.
+        betas, weight_decay: of AdamW.
+        warmup_steps: until the peak is reached, on a line.
+        warmup_start: part of the peak at which the line begins.
+        clip_norm: largest norm of the gradient.
+        decay_all: norms, biases and other single rows are decayed as well.
+        average_decay: of the moving average of the weights; 0 for none.
+        final_fraction: part of the peak that is left at the end.
+        rates: factors of the rate, by the beginning of the parameters' names; the longest counts, and 1 for others.
+    """
+
+    learning_rate: float = 1e-3
+    betas: tuple[float, float] = (0.9, 0.98)
+    weight_decay: float = 0.02
+    warmup_steps: int = 150
+    warmup_start: float = 0.0
+    clip_norm: float = 10.0
+    decay_all: bool = False
+    average_decay: float = 0.998
+    final_fraction: float = 0.02
+    rates: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Budget:
-    """How long a stage trains: until either limit is reached; progress is the larger part.
+class ClipSettings:
+    """Clips: a frame, and ``frames - 1`` others drawn from the ``span`` frames before it."""
 
-    Attributes:
-        minutes: wall time, or None.
-        steps: optimiser steps, or None.
-    """
-
-    minutes: float | None = None
-    steps: int | None = None
-
-    def progress(self, steps: int, seconds: float) -> float:
-        """Return the part that is used up, 1 and more when it is over."""
-        of_time = seconds / (self.minutes * 60) if self.minutes else 0.0
-        of_steps = steps / self.steps if self.steps else 0.0
-        return max(of_time, of_steps)
+    frames: int = 5
+    span: int = 10
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """The temporal stage: streams that carry their state across optimiser steps.
+    """Streams that carry their state across optimiser steps.
 
     Attributes:
-        streams: streams side by side in one process.
+        streams: side by side in one process.
         frames: consecutive frames that share a gradient.
         longest: longest stream, frames; it grows from ``frames`` to this over ``growth_steps`` steps.
         growth_steps: see above.
-        score: rows above it become tracks.
-        track_dropout: probability that a track is forgotten.
-        state_dropout: probability that a stream forgets everything.
-        false_tracks: at most this many unassigned detections per frame become tracks.
-        refresh: probability that a better-scored detection replaces its track's query and points.
-        capacity: most tracks of a stream.
     """
 
     streams: int = 4
     frames: int = 2
     longest: int = 40
     growth_steps: int = 400
-    score: float = 0.3
-    track_dropout: float = 0.12
-    state_dropout: float = 0.03
-    false_tracks: int = 3
-    refresh: float = 0.3
-    capacity: int = 40
 
 
 @dataclass(frozen=True)
-class ClipSettings:
-    """Clips, noise and weights. Those of the baseline's own losses are constants of its module.
+class TrackRules:
+    """Which rows of a frame are the tracks of the next one.
 
     Attributes:
-        frames: of a clip.
-        span: the others are drawn from so many frames before the last one.
-        track_score: rows above it after a frame are the tracks of the next.
-        angle_noise: deviation of the Euler angles of the ego motion, radians.
-        distance_noise: deviation of its x and y, metres.
-        mask_dice, mask_entropy: lambda_dice and lambda_bce of Sec. 3.6.
-        forecast: weight of L_pred, per metre; the paper names none.
-        depth: weight of L_depth, as MapTRv2 has it.
+        score: rows from it on become tracks.
+        track_dropout: probability that a track is forgotten.
+        state_dropout: probability that a stream forgets everything.
+        false_tracks: at most this many unassigned detections per frame become tracks; None for all.
+        refresh: probability that a better-scored detection replaces its track's query and points.
+        capacity: most tracks of a stream, or None.
     """
 
-    frames: int = 5
-    span: int = 10
-    track_score: float = 0.4
-    angle_noise: float = 0.08
-    distance_noise: float = 0.25
-    mask_dice: float = 2.0
-    mask_entropy: float = 1.0
-    forecast: float = 1.0
-    depth: float = 3.0
+    score: float = 0.4
+    track_dropout: float = 0.0
+    state_dropout: float = 0.0
+    false_tracks: int | None = None
+    refresh: float = 0.0
+    capacity: int | None = None
 
 
 @dataclass(frozen=True)
-class ClipStage:
-    """What one stage trains.
+class Stage:
+    """What one stage trains: the data, what is frozen, the rates, and the losses.
 
     Attributes:
         name: of the stage.
-        epochs: of the paper on nuScenes (Sec. 4.1); they share out the time of a run.
+        data: single ``frames``; ``clips`` of images; or ``streams`` over BEV features that are computed once.
+        epochs: how often each frame is seen; a frame of a clip counts as its last one.
+        batch: frames, clips or streams of one step over all processes, for which the learning rate holds.
+        per_device: those of one GPU by default; None takes ``batch`` whatever the number of devices.
+        share: of a budget of minutes.
+        losses: their weights.
+        optimiser: rates and schedule.
+        tracks: how tracks are chosen; None for a stage without.
         vectors: polylines, tracks and all of the paper's modules; otherwise segmentation and depth only.
         images: frames of a clip whose images are trained on; the others go through the image backbone without
             gradient, to save memory.
         frozen: parts of the network that do not change.
         memory_from_step: the vector memory is not used before.
-        rates: factors of the learning rate, by the beginning of the parameters' names; the longest counts.
-        final_rate: part of the learning rate that is left at the end.
+        angle_noise: deviation of the Euler angles of the ego motion, radians.
+        distance_noise: deviation of its x and y, metres.
+        augmentation: changes to frames.
+        clips, streams: sizes of the data.
     """
 
     name: str
+    data: Literal["frames", "clips", "streams"]
     epochs: int
+    batch: int
+    losses: LossWeights
+    optimiser: OptimiserSettings
+    per_device: int | None = None
+    share: int = 1
+    tracks: TrackRules | None = None
     vectors: bool = True
     images: Literal["first and last", "last", "none"] = "last"
     frozen: tuple[str, ...] = ()
     memory_from_step: int = 0
-    rates: Mapping[str, float] = field(default_factory=dict)
-    final_rate: float = 0.05
+    angle_noise: float = 0.0
+    distance_noise: float = 0.0
+    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
+    clips: ClipSettings = field(default_factory=ClipSettings)
+    streams: StreamSettings = field(default_factory=StreamSettings)
 
     def trains_images(self, number: int, frames: int) -> bool:
-        """Whether the images of frame ``number`` of a clip are trained on."""
+        """Whether the images of frame ``number`` of ``frames`` are trained on."""
         first, last = self.images == "first and last" and number == 0, number == frames - 1
         return self.images != "none" and (first or last)
 
+    @property
+    def frames(self) -> int:
+        """Frames of one sample."""
+        return {"frames": 1, "clips": self.clips.frames, "streams": self.streams.frames}[self.data]
 
+
+BEV_PARTS = ("image_backbone", "bev_encoder", "segmentation_head", "depth_head")
 SLOW_IMAGES = {"image_backbone.resnet": 0.1}
-CLIP_STAGES = (
-    ClipStage("bev", 18, vectors=False, images="first and last", rates=SLOW_IMAGES),
-    ClipStage("warmup", 6, images="none", frozen=BEV_PARTS, memory_from_step=500, rates=SLOW_IMAGES, final_rate=0.95),
-    ClipStage(
-        "joint",
-        48,
-        rates={**SLOW_IMAGES, "image_backbone": 0.5, "bev_encoder": 0.5, "bev_encoder.queries": 1.0}
-        | {"segmentation_head": 0.5},
-        final_rate=3e-3,
-    ),
-)
-CLIP_OPTIMISER = OptimiserSettings(
+SLOW_BEV = {"image_backbone": 0.5, "bev_encoder": 0.5, "bev_encoder.queries": 1.0, "segmentation_head": 0.5}
+MAPTRACKER_GPUS = 8
+MAPTRACKER_OPTIMISER = OptimiserSettings(
     learning_rate=5e-4,
     betas=(0.9, 0.999),
     weight_decay=0.01,
@@ -145,110 +162,71 @@ CLIP_OPTIMISER = OptimiserSettings(
     warmup_start=1 / 3,
     clip_norm=35.0,
     average_decay=0.0,
+    rates=SLOW_IMAGES,
 )
-"""MapTracker's, which averages no weights; rates and the end come from the stage."""
-SINGLE_SHARE = 2 / 3
-"""Of the time of a lite run, for its single-frame stage."""
 
 
-@dataclass(frozen=True)
-class TrainingSettings:
-    """Settings of one run.
-
-    Attributes:
-        batch: frames of one optimiser step of the single-frame stage, or clips of one step, over all processes.
-        seed: of weights, draws and augmentation.
-        single, temporal: budgets of the two stages of the lite network; None skips a stage.
-        clip_stages: the stages of a network that trains in clips, each with its budget.
-        validation_minutes, checkpoint_minutes: intervals.
-        log_steps: steps between two lines of metrics.
-        weights: of the losses of the lite network.
-        costs: of the assignment of predictions to truth in the lite network.
-        optimiser: of the single-frame stage.
-        temporal_optimiser: of the temporal stage.
-        augmentation: changes to the images of all stages that read images; only the single-frame stage mirrors.
-        streams: of the temporal stage.
-        clips: clips, noise and loss weights of the clip stages.
-        clip_optimiser: of the clip stages; each stage adds its rates and its end.
-    """
-
-    batch: int = 6
-    seed: int = 0
-    single: Budget | None = field(default_factory=Budget)
-    temporal: Budget | None = None
-    clip_stages: tuple[tuple[ClipStage, Budget], ...] = ()
-    validation_minutes: float = 8.0
-    checkpoint_minutes: float = 3.0
-    log_steps: int = 20
-    weights: LossWeights = field(default_factory=LossWeights)
-    costs: MatchingCosts = field(default_factory=MatchingCosts)
-    optimiser: OptimiserSettings = field(default_factory=OptimiserSettings)
-    temporal_optimiser: OptimiserSettings = field(default_factory=lambda: OptimiserSettings(learning_rate=5e-4))
-    augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
-    streams: StreamSettings = field(default_factory=StreamSettings)
-    clips: ClipSettings = field(default_factory=ClipSettings)
-    clip_optimiser: OptimiserSettings = CLIP_OPTIMISER
+MAPTRACKER_AUGMENTATION = AugmentationSettings(
+    mirror=0.0,
+    grid_mask=0.7,
+    camera_dropout=0.0,
+    calibration=CalibrationNoise(probability=0.0),
+)
 
 
-def plan_run(
-    config: PredMapNetConfig,
-    stage: str,
-    minutes: float,
-    steps: int | None,
-    batch: int | None = None,
-    learning_rate: float | None = None,
-    seed: int = 0,
-) -> TrainingSettings:
-    """Share out the time of a run over the stages of a network.
+def _clip_stage(name: str, epochs: int, per_device: int, final: float, **changes: object) -> Stage:
+    """Return a stage of the paper: clips of five frames, noisy poses, confident rows are tracks."""
+    stage = Stage(
+        name=name,
+        data="clips",
+        epochs=epochs,
+        batch=MAPTRACKER_GPUS * per_device,
+        per_device=per_device,
+        losses=PAPER_LOSSES,
+        optimiser=replace(MAPTRACKER_OPTIMISER, final_fraction=final),
+        tracks=TrackRules(score=0.4),
+        augmentation=MAPTRACKER_AUGMENTATION,
+        angle_noise=0.08,
+        distance_noise=0.25,
+    )
+    return replace(stage, **changes)  # type: ignore[arg-type]
 
-    Args:
-        config: of the network.
-        stage: name of one, or ``all``.
-        minutes: of all stages together.
-        steps: limit of optimiser steps per stage, or None.
-        batch: see :class:`TrainingSettings`; 6 frames or 1 clip by default.
-        learning_rate: peak of the clip stages or of the single-frame stage; None takes the default.
-        seed: of weights and draws.
 
-    Raises:
-        UserError: the network has no such stage.
-    """
-    settings = TrainingSettings(seed=seed)
-    if trains_in_clips(config):
-        stages = choose_clip_stages(stage)
-        epochs = sum(chosen.epochs for chosen in stages)
-        return replace(
-            settings,
-            batch=batch or 1,
-            single=None,
-            clip_stages=tuple((chosen, Budget(minutes * chosen.epochs / epochs, steps)) for chosen in stages),
-            clip_optimiser=_with_rate(settings.clip_optimiser, learning_rate),
-        )
-    if stage not in ("single", "temporal", "all"):
-        raise UserError(f"There is no stage '{stage}' for this network. Choose: single, temporal, all.")
-    share = SINGLE_SHARE if stage == "all" else 1.0
-    rest = 1 - SINGLE_SHARE if stage == "all" else 1.0
-    return replace(
-        settings,
-        batch=batch or settings.batch,
-        single=Budget(minutes * share, steps) if stage != "temporal" else None,
-        temporal=Budget(minutes * rest, steps) if stage != "single" else None,
-        optimiser=_with_rate(settings.optimiser, learning_rate),
+def _paper_stages(bev: int, warmup: int, joint: int) -> tuple[Stage, ...]:
+    """Return the three stages of Sec. 4.1 with their epochs."""
+    last = _clip_stage("joint", joint, 2, 0.003)
+    return (
+        _clip_stage("bev", bev, 1, 0.05, vectors=False, images="first and last"),
+        _clip_stage("warmup", warmup, 6, 0.95, images="none", frozen=BEV_PARTS, memory_from_step=500),
+        replace(last, optimiser=replace(last.optimiser, rates={**SLOW_IMAGES, **SLOW_BEV})),
     )
 
 
-def _with_rate(settings: OptimiserSettings, rate: float | None) -> OptimiserSettings:
-    return settings if rate is None else replace(settings, learning_rate=rate)
+NUSCENES_STAGES = _paper_stages(bev=18, warmup=6, joint=48)
+ARGOVERSE2_STAGES = _paper_stages(bev=12, warmup=3, joint=20)
+LITE_STAGES = (
+    Stage("single", "frames", epochs=24, batch=6, share=2, losses=LITE_LOSSES, optimiser=OptimiserSettings()),
+    Stage(
+        "temporal",
+        "streams",
+        epochs=24,
+        batch=8,
+        losses=LITE_LOSSES,
+        optimiser=OptimiserSettings(learning_rate=5e-4),
+        tracks=TrackRules(0.3, track_dropout=0.12, state_dropout=0.03, false_tracks=3, refresh=0.3, capacity=40),
+        frozen=("image_backbone", "bev_encoder", "depth_head"),
+    ),
+)
 
 
-def trains_in_clips(config: PredMapNetConfig) -> bool:
-    """Whether a network is trained in clips (MapTracker's decoder) or in the two stages of ``lite``."""
-    return isinstance(config.decoder, MapTrackerDecoderConfig)
-
-
-def choose_clip_stages(name: str) -> tuple[ClipStage, ...]:
-    """Return one stage by name, or all of them for ``all``. Raises UserError for another name."""
-    names = [stage.name for stage in CLIP_STAGES]
-    if name != "all" and name not in names:
-        raise UserError(f"There is no stage '{name}' for this network. Choose: {', '.join(names)}, all.")
-    return tuple(stage for stage in CLIP_STAGES if name in ("all", stage.name))
+def choose_stages(config: PredMapNetConfig, name: str = "all") -> tuple[Stage, ...]:
+    """Return the stages of a network in their order, or one of them. Raises UserError for another name."""
+    stages: tuple[Stage, ...] = LITE_STAGES
+    if isinstance(config.decoder, MapTrackerDecoderConfig):
+        argoverse = isinstance(config.bev, BevFormerConfig) and config.bev.cameras == ARGOVERSE2_CAMERAS
+        stages = ARGOVERSE2_STAGES if argoverse else NUSCENES_STAGES
+    chosen = tuple(stage for stage in stages if name in ("all", stage.name))
+    if not chosen:
+        names = ", ".join(stage.name for stage in stages)
+        raise UserError(f"There is no stage '{name}' for this network. Choose: {names}, all.")
+    return chosen

@@ -1,15 +1,15 @@
-"""Chamfer mAP on validation scenes while training, single frames or whole streams."""
+"""Chamfer mAP and C-mAP on validation scenes while training, single frames or whole streams, shared out over ranks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+import torch.distributed as distributed
 
 from mapfusion.elements import FrameMap
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
+from predmapnet.evaluation.consistency_ap import consistency_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.image_input import normalise_images
@@ -18,8 +18,6 @@ from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
 from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 
-Float = NDArray[np.float64]
-
 EVERY = 4
 """Every fourth frame is measured: neighbours look alike."""
 FIRST = 3
@@ -27,36 +25,49 @@ FIRST = 3
 FRAME_INTERVAL_NS = 500_000_000
 
 
-@torch.no_grad()
 def validate(network: PredMapNet, scenes: Sequence[CachedScene], streaming: bool) -> dict[str, float]:
-    """Measure a network on cached scenes.
+    """Measure a network on cached scenes; each process maps some of them, and all get the figures.
 
     Args:
         network: in evaluation mode.
-        scenes: whole scenes.
+        scenes: whole scenes, the same in all processes.
         streaming: run each scene from its start with state; otherwise every frame stands alone. The frames that
             are measured are the same.
 
     Returns:
-        ``mAP`` and per kind the AP averaged over thresholds, and at each threshold, all in [0, 1].
+        ``mAP`` and per kind the AP averaged over thresholds, and at each threshold, all in [0, 1]; ``C-mAP`` of all
+        frames of streams.
     """
-    frames: list[EvaluationFrame] = []
-    for scene in scenes:
-        measured = range(FIRST, len(scene), EVERY)
-        indices = range(len(scene)) if streaming else measured
-        maps = map_frames(network, scene, indices, streaming)
-        frames += [
-            EvaluationFrame(scene.name, index, predicted, scene.frame(index, images=False).truth)
-            for index, predicted in zip(indices, maps, strict=True)
-            if index in measured
-        ]
-    result = chamfer_average_precision(frames, thresholds_for(network.config.roi))
+    alone = not distributed.is_initialized()
+    rank, size = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
+    own = [_mapped(network, scene, streaming) for scene in scenes[rank::size]]
+    everyone = [own] * size
+    if not alone:
+        distributed.all_gather_object(everyone, own)
+    # In the order of the scenes: first the first of each process, and so on.
+    mapped = [everyone[number % size][number // size] for number in range(len(scenes))]
+    thresholds = thresholds_for(network.config.roi)
+    frames = [frame for scene in mapped for frame in scene]
+    measured = [frame for frame in frames if frame.index % EVERY == FIRST]
+    result = chamfer_average_precision(measured, thresholds)
     figures = {"mAP": result.mean}
+    if streaming:
+        figures["C-mAP"] = consistency_average_precision(frames, thresholds).mean
     for of_kind in result.kinds:
         figures[of_kind.kind.label] = of_kind.average_precision
         for curve in of_kind.curves:
             figures[f"{of_kind.kind.label}@{curve.threshold:g}"] = curve.average_precision
     return figures
+
+
+def _mapped(network: PredMapNet, scene: CachedScene, streaming: bool) -> list[EvaluationFrame]:
+    """Map one scene: all frames of a stream, or those that are measured."""
+    indices = range(len(scene)) if streaming else range(FIRST, len(scene), EVERY)
+    maps = map_frames(network, scene, indices, streaming)
+    return [
+        EvaluationFrame(scene.name, index, predicted, scene.frame(index, images=False).truth)
+        for index, predicted in zip(indices, maps, strict=True)
+    ]
 
 
 @torch.no_grad()

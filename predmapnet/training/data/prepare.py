@@ -142,6 +142,19 @@ def _prepare(
     return folder, learned, measured
 
 
+def count_frames(options: DataOptions) -> int:
+    """Return how many frames an epoch has; nothing is made. Raises UserError for data that is not there."""
+    total = 0.0
+    for chosen in options.sets:
+        if chosen.name == DEMO:
+            infos, learned = scene_infos("train"), _demo_names("train", options.towns)
+        else:
+            infos = tuple(open_source(chosen.name, chosen.root, options.split_scheme)[0].scenes())
+            learned, _ = _names(infos, options.validation)
+        total += chosen.weight * sum(info.frames for info in infos if info.name in set(learned))
+    return round(total)
+
+
 def _demo_names(split: str, count: int) -> list[str]:
     names = [info.name for info in scene_infos(split)]
     if count > len(names):

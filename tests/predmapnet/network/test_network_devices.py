@@ -11,14 +11,11 @@ from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures
 from predmapnet.network.track_selection import select
-from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.clips import clip_frame
 from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.targets import Targets
-from predmapnet.training.optimiser import OptimiserSettings, WeightAverage, make_optimiser
-from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.settings import CLIP_STAGES, ClipSettings, StreamSettings, TrainingSettings
-from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.instants import StageTraining
+from predmapnet.training.optimiser import WeightAverage, make_optimiser
+from predmapnet.training.settings import LITE_STAGES, NUSCENES_STAGES, OptimiserSettings, TrackRules
 from tests.predmapnet.network.conftest import SMALL
 from tests.predmapnet.network.small_baseline import SIZE, small_config, two_cameras
 from tests.predmapnet.pretended_gpu import pretended_gpu
@@ -92,7 +89,7 @@ def test_a_stream_stays_on_the_gpu(name):
         gpu.put_network(network)
         state = None
         for frame in frames:
-            inputs = clip_frame(frame, network).inputs
+            inputs = StageTraining(network, NUSCENES_STAGES[-1])._inputs(frame)
             outputs = network(inputs, state)
             selection = select(outputs, state, config)
             state = network.advance(state, outputs, selection.instances, inputs, selection.lost)
@@ -101,25 +98,24 @@ def test_a_stream_stays_on_the_gpu(name):
         assert state.instances.valid.any(), "there were tracks"
 
 
-@pytest.mark.parametrize("stage", CLIP_STAGES, ids=lambda stage: stage.name)
+@pytest.mark.parametrize("stage", NUSCENES_STAGES, ids=lambda stage: stage.name)
 def test_a_training_step_of_the_papers_network_stays_on_the_gpu(stage):
     config = small_config("paper-nuscenes")
     network = network_of(config)
     frames = [instant(config, number, SIZE, 2) for number in range(FRAMES)]
+    training = StageTraining(network, stage)
     with pretended_gpu() as gpu:
-        gpu.put_network(network)
-        clip = [clip_frame(frame, network) for frame in frames]
-        generator = torch.Generator().manual_seed(0)
-        terms = clip_losses(network, clip, stage, ClipSettings(), 1000, generator)
+        gpu.put_network(training)
+        terms = training(StreamSegment(frames), 1000)
         assert all(term.device == gpu.device for term in terms.values())
         assert ("transformation" in terms) == stage.vectors
         optimise(network, terms, gpu)
 
 
-def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
+def test_a_training_step_of_lite_streams_stays_on_the_gpu():
     config = PredMapNetConfig.model_validate(SMALL)
     network = network_of(config)
-    settings = TrainingSettings(streams=StreamSettings(streams=STREAMS, frames=FRAMES, score=0.05, track_dropout=0.0))
+    stage = replace(LITE_STAGES[1], tracks=TrackRules(score=0.05))
     frames = [instant(config, number, (24, 64), 6) for number in range(FRAMES)]
     rows, columns = config.bev.rows, config.bev.columns
     features = BevFeatures(
@@ -131,12 +127,13 @@ def test_a_training_step_of_lite_streams_stays_on_the_gpu(tmp_path):
     fresh = torch.tensor([True, False])
     clip = StreamSegment(frames, [features] * FRAMES, fresh, replace(frames[0].targets))
     with pretended_gpu() as gpu:
-        gpu.put_network(network)
-        stage = TemporalStage(network, None, settings, tmp_path, ProcessGroup())
+        training = StageTraining(network, stage)
+        gpu.put_network(training)
         for step in range(2):
-            terms = stage.losses(step, clip)
+            terms = training(clip, step)
         assert all(term.device == gpu.device for term in terms.values())
-        assert all(value.device == gpu.device for value in stage.state().values())
+        carried = {name: value for name, value in training.tensors().items() if name.startswith("state")}
+        assert all(value.device == gpu.device for value in carried.values())
         assert float(terms["forecast"]) > 0.0, "there were tracks"
         optimise(network, terms, gpu)
 

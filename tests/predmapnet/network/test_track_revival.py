@@ -14,7 +14,7 @@ from predmapnet.network.polylines import clip_polylines
 from predmapnet.network.revival import point_line_distances
 from predmapnet.network.state import FrameInputs, FrameOutputs, LayerPredictions, StreamState
 from predmapnet.network.track_selection import select
-from predmapnet.training.temporal import detached, forget
+from predmapnet.training.instants import detached, forget
 
 ROI = torch.tensor([60.0, 30.0])
 DIVIDER, BOUNDARY = 1, 2

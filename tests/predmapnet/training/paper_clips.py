@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,13 +18,13 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import StreamState
 from predmapnet.presets import parse_config
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.clip_losses import ClipFrame, clip_losses
+from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.targets import truth_targets
-from predmapnet.training.settings import CLIP_STAGES, ClipSettings, ClipStage
+from predmapnet.training.instants import StageTraining
+from predmapnet.training.settings import NUSCENES_STAGES, Stage
 from tests.predmapnet.network.small_baseline import frames, small_config
 
-BEV, WARMUP, JOINT = CLIP_STAGES
-CALM = ClipSettings(angle_noise=0.0, distance_noise=0.0)
+BEV, WARMUP, JOINT = NUSCENES_STAGES
 GRID = (100, 200)
 DIVIDER, BOUNDARY = ElementKind.DIVIDER, ElementKind.BOUNDARY
 
@@ -111,7 +112,7 @@ def line(y: float, x: float = 0.0, length: float = 30.0) -> np.ndarray:
 
 def clip_of(
     network: PredMapNet, instants: Sequence[Sequence[Piece]], seed: int = 0, depth: Tensor | None = None
-) -> list[ClipFrame]:
+) -> list[Batch]:
     """Return a clip of one stream that sees random images and the given truth."""
     config = network.config
     clip = []
@@ -121,18 +122,20 @@ def clip_of(
             tuple(points for _, _, points in pieces),
             np.array([number for _, number, _ in pieces], dtype=np.int64),
         )
-        clip.append(ClipFrame(inputs, truth_targets([truth], config.roi, config.decoder.points, GRID), depth))
+        targets = truth_targets([truth], config.roi, config.decoder.points, GRID)
+        clip.append(Batch(**vars(inputs), targets=targets, depth=depth))
     return clip
 
 
 def losses(
     network: PredMapNet,
-    clip: Sequence[ClipFrame],
-    stage: ClipStage = JOINT,
-    settings: ClipSettings = CALM,
+    clip: Sequence[Batch],
+    stage: Stage = JOINT,
     step: int = 1000,
     seed: int = 0,
+    noise: tuple[float, float] = (0.0, 0.0),
+    **weights: float,
 ) -> dict[str, Tensor]:
-    """Return the weighted losses of a clip by name."""
-    generator = torch.Generator().manual_seed(seed)
-    return clip_losses(network, clip, stage, settings, step, generator)
+    """Return the losses of a clip by name, with other weights and noise of the ego motion (angle, distance)."""
+    stage = replace(stage, losses=replace(stage.losses, **weights), angle_noise=noise[0], distance_noise=noise[1])
+    return StageTraining(network, stage, (seed,))(StreamSegment(list(clip)), step)

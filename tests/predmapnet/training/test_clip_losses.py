@@ -6,14 +6,10 @@ import pytest
 import torch
 from tiny_clips import painted_clip, tiny_network, tiny_paper_config
 
-from predmapnet.errors import UserError
-from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.presets import preset
-from predmapnet.training.clip_losses import clip_losses
-from predmapnet.training.settings import CLIP_STAGES, ClipSettings
+from predmapnet.network.image_input import normalise_images
+from tests.predmapnet.training import paper_clips
+from tests.predmapnet.training.paper_clips import BEV, JOINT, WARMUP
 
-BEV, WARMUP, JOINT = CLIP_STAGES
-CALM = ClipSettings(angle_noise=0.0, distance_noise=0.0)
 CONFIG = tiny_paper_config()
 
 
@@ -22,9 +18,8 @@ def clip(tmp_path_factory):
     return painted_clip(tmp_path_factory.mktemp("clips"), CONFIG, frames=3)
 
 
-def losses(network, clip, stage=JOINT, settings=CALM, step=1000, frames=3):
-    generator = torch.Generator().manual_seed(0)
-    return clip_losses(network, clip[:frames], stage, settings, step, generator)
+def losses(network, clip, stage=JOINT, step=1000, frames=3):
+    return paper_clips.losses(network, clip[:frames], stage, step)
 
 
 def test_joint_training_reaches_every_parameter_and_learns(clip):
@@ -58,12 +53,12 @@ def test_the_first_stage_trains_the_segmentation_and_depth_only(clip):
 
 def test_images_learn_from_the_frames_of_their_stage_only(clip):
     for stage, learns in ((BEV, [True, False, True]), (JOINT, [False, False, True]), (WARMUP, [False] * 3)):
-        frames = [replace(frame, inputs=replace(frame.inputs)) for frame in clip]
-        for frame in frames:
-            frame.inputs.images = frame.inputs.images.clone().requires_grad_()
+        frames = [
+            replace(frame, images=normalise_images(frame.images, CONFIG.image).requires_grad_()) for frame in clip
+        ]
         terms = losses(tiny_network(CONFIG), frames, stage)
         torch.stack(list(terms.values())).sum().backward()
-        assert [frame.inputs.images.grad is not None for frame in frames] == learns
+        assert [frame.images.grad is not None for frame in frames] == learns
 
 
 def test_a_memory_that_is_not_used_yet_changes_nothing(clip):
@@ -102,8 +97,3 @@ def test_without_truth_there_is_only_background(clip):
     terms = losses(tiny_network(CONFIG), empty)
     assert float(terms["points"].detach()) == float(terms["mask"].detach()) == float(terms["forecast"].detach()) == 0.0
     assert float(terms["focal"].detach()) > 0.0
-
-
-def test_a_network_without_tracks_of_this_kind_is_refused(clip):
-    with pytest.raises(UserError, match="lite does not train in clips"):
-        clip_losses(PredMapNet(preset("lite")), clip, JOINT, CALM, 0, torch.Generator())

@@ -1,29 +1,30 @@
-"""The paper's network trains through its three stages in the training loop, from a baseline's weights if wanted."""
+"""Runs from their options to their weights: all stages, their rates, and what they leave as it is."""
 
-import json
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
 import pytest
 import torch
-from painted_scenes import painted_scenes
-from tiny_clips import tiny_paper_config
 
-from predmapnet.errors import UserError
+from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.presets import preset
-from predmapnet.training.clips import ClipTraining
+from predmapnet.training import run_checkpoint
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.depth_targets import UNKNOWN
 from predmapnet.training.data.draws import Clips, step_loader
-from predmapnet.training.loop import Trainer
+from predmapnet.training.data.prepare import DataOptions, DataSet
+from predmapnet.training.loop import BEST
 from predmapnet.training.optimiser import make_optimiser
-from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.settings import BEV_PARTS, CLIP_STAGES, Budget, ClipSettings, plan_run
+from predmapnet.training.plan import PlanOptions
+from predmapnet.training.run import RunOptions, export, run_stages
+from predmapnet.training.settings import BEV_PARTS, NUSCENES_STAGES
+from predmapnet.weights.checkpoint import load_checkpoint
+from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
+from tests.predmapnet.training.small_runs import OFTEN, metrics, one_process, quiet
+from tests.predmapnet.training.tiny_clips import tiny_paper_config
 
 CONFIG = tiny_paper_config()
-SETTINGS = replace(plan_run(CONFIG, "all", 1.0, 1), clips=ClipSettings(frames=2, span=3), log_steps=1)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -31,22 +32,38 @@ def scenes(tmp_path_factory):
     return painted_scenes(tmp_path_factory.mktemp("scenes"), 5, CONFIG)
 
 
-def test_a_run_goes_through_all_stages_and_freezes_what_they_leave(scenes, tmp_path):
-    torch.manual_seed(0)
-    network = PredMapNet(CONFIG)
-    trainer = Trainer(network, SETTINGS, tmp_path, ProcessGroup(), lambda _line: None)
-    for stage, budget in SETTINGS.clip_stages:
-        trainable = ClipTraining(stage, network, scenes, SETTINGS, ProcessGroup())
-        frozen = [getattr(network, part) for part in stage.frozen]
-        before = [{name: value.clone() for name, value in part.named_parameters()} for part in frozen]
-        optimiser = replace(SETTINGS.clip_optimiser, rates=stage.rates, average_decay=0.0)
-        assert trainer.run(trainable, budget, optimiser, lambda _network, _stage: {})
-        for part, values in zip(frozen, before, strict=True):
-            assert all(torch.equal(value, values[name]) for name, value in part.named_parameters())
-    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert trainer.position.finished == ["bev", "warmup", "joint"]
-    assert {line["stage"] for line in lines} == {"bev", "warmup", "joint"}
-    assert all("segmentation" in line for line in lines if "loss" in line)
+def parameters(checkpoint):
+    """Of the network in a checkpoint, without the statistics of batch norms."""
+    tensors = run_checkpoint.below_prefix("network", run_checkpoint.read_tensors(checkpoint, "network"))
+    return {name: value for name, value in tensors.items() if "running" not in name and "batches" not in name}
+
+
+def test_a_run_of_the_papers_network_goes_through_its_stages_and_freezes_what_they_leave(scenes, tmp_path):
+    options = RunOptions(CONFIG, None, tmp_path, plan=PlanOptions(batch=1, steps=1), loop=OFTEN)
+    assert run_stages(one_process(), options, (scenes, []), quiet)
+    assert [line["stage"] for line in metrics(tmp_path)] == ["bev", "warmup", "joint"]
+    bev, warmup, joint = (parameters(path) for path in sorted(tmp_path.glob("frames-*")))
+    for before, after, learns_bev in ((bev, warmup, False), (warmup, joint, True)):
+        changed = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+        assert "map_decoder" in changed
+        assert (changed >= set(BEV_PARTS)) if learns_bev else not (changed & set(BEV_PARTS))
+
+
+def test_lite_is_validated_and_its_averaged_and_best_weights_can_be_used(tmp_path):
+    config = tiny_config()
+    scenes = painted_scenes(tmp_path / "scenes", 8, config, (DEMO_RIG,))
+    demo = DataOptions((DataSet("demo"),), tmp_path)
+    options = RunOptions(config, demo, tmp_path / "run", plan=PlanOptions(batch=2, steps=2), loop=OFTEN)
+    assert run_stages(one_process(), options, (scenes, list(scenes.scenes)), quiet)
+    measured = [line for line in metrics(tmp_path / "run") if "val_mAP" in line]
+    assert ["val_C-mAP" in line for line in measured if line["step"] == 2] == [False, True], "of streams only"
+    shipped = load_checkpoint(export(options))
+    assert shipped.facts["finished"] == ["single", "temporal"]
+    newest = run_checkpoint.read_tensors(run_checkpoint.latest(tmp_path / "run"), "network")
+    average = run_checkpoint.below_prefix("average", newest)
+    assert all(torch.equal(value, average[name]) for name, value in shipped.network.state_dict().items())
+    best = {line["stage"]: line["val_mAP"] for line in measured}
+    assert (tmp_path / "run" / BEST).exists() == any(value > 0 for value in best.values())
 
 
 def test_clips_end_with_their_frame_and_repeat_for_a_seed(scenes):
@@ -63,22 +80,10 @@ def test_clips_end_with_their_frame_and_repeat_for_a_seed(scenes):
     assert (first.instants[0].depth != UNKNOWN).any()
 
 
-def test_a_plan_shares_out_the_time_and_refuses_stages_of_other_networks():
-    shares = [budget for _, budget in plan_run(CONFIG, "all", 72.0, None).clip_stages]
-    assert shares == [Budget(18.0), Budget(6.0), Budget(48.0)]
-    assert [stage.name for stage, _ in plan_run(CONFIG, "joint", 70.0, 3).clip_stages] == ["joint"]
-    lite = plan_run(preset("lite"), "all", 60.0, None)
-    assert (lite.single, lite.temporal, lite.clip_stages) == (Budget(40.0), Budget(pytest.approx(20.0)), ())
-    for config, stage in ((CONFIG, "single"), (preset("lite"), "joint")):
-        with pytest.raises(UserError, match=f"no stage '{stage}'"):
-            plan_run(config, stage, 1.0, None)
-
-
 def test_parts_learn_at_their_own_rates():
     network = PredMapNet(CONFIG)
-    for stage in CLIP_STAGES:
-        settings = replace(SETTINGS.clip_optimiser, rates=stage.rates)
-        groups = make_optimiser(network, settings).param_groups
+    for stage in NUSCENES_STAGES:
+        groups = make_optimiser(network, stage.optimiser).param_groups
         rates = {id(p): group["rate"] for group in groups for p in group["params"]}
         assert len(rates) == len(list(network.parameters()))
         joint = stage.name == "joint"

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.training.losses.maptracker import (
-    CLASS_WEIGHT,
-    LINE_WEIGHT,
-    all_orders,
-    assign_layer,
-    layer_losses,
-    line_cost,
-    segmentation_losses,
-)
-from predmapnet.training.losses.matching import focal_class_cost
+from predmapnet.network.state import FrameOutputs, LayerPredictions
+from predmapnet.training.data.targets import Targets
+from predmapnet.training.losses.frame import LossSums, add_layers
+from predmapnet.training.losses.matching import Truth, focal_class_cost, line_costs, match
+from predmapnet.training.losses.terms import segmentation_losses
+from predmapnet.training.losses.weights import PAPER_LOSSES
+from predmapnet.training.track_truth import TrackTruth
 from tests.predmapnet.network.maptracker_reference import FOLDER, load_reference
 
 pytestmark = pytest.mark.reference
@@ -39,41 +36,77 @@ def close(found, wanted):
     torch.testing.assert_close(found, wanted.reshape(found.shape), rtol=1e-5, atol=2e-5)
 
 
+class OfficialTruth(Truth):
+    """Truth whose orders are the official ones."""
+
+    def __init__(self, orders, labels):
+        points = orders[:, 0].unflatten(-1, (-1, 2))
+        count = len(points)
+        zeros = torch.zeros(count, dtype=torch.int64)
+        targets = Targets(
+            1, zeros, labels, torch.arange(count), points, torch.zeros(count, 1, 1), torch.zeros(1, 3, 1, 1)
+        )
+        super().__init__(targets, torch.device("cpu"), torch.ones(2))
+        self.official = orders
+
+    def orders(self):
+        pieces, orders = self.official.shape[:2]
+        owner = torch.arange(pieces).repeat_interleave(orders)[None]
+        return self.official.flatten(0, 1)[None], owner, pieces
+
+
 def test_costs(given, expected):
     count = len(expected["cost"])
-    distance, order = line_cost(given["lines"][:count], given["gt_lines"])
-    close(distance, expected["reg_cost_unweighted"])
+    truth = OfficialTruth(given["gt_lines"], given["gt_labels"])
+    distance = line_costs(given["lines"][None, :count], *truth.orders(), PAPER_LOSSES.cost_beta)[0]
+    close(2 * distance, expected["reg_cost_unweighted"])
     close(
-        CLASS_WEIGHT * focal_class_cost(given["logits"][:count])[:, given["gt_labels"]] + LINE_WEIGHT * distance,
+        PAPER_LOSSES.cost_focal * focal_class_cost(given["logits"][:count])[:, given["gt_labels"]]
+        + PAPER_LOSSES.cost_points * distance,
         expected["cost"],
     )
-    assert torch.equal(order, expected["best_permutation"])
 
 
 @pytest.mark.parametrize("case", ["plain", "tracks"])
 def test_assignment_and_losses_of_a_layer(given, expected, case):
     count = len(expected[f"{case}/target_labels"])
-    logits, lines = given["logits"][:count], given["lines"][:count]
-    detection, continued = torch.ones(count, dtype=torch.bool), torch.full((count,), -1)
-    valid = torch.ones(count, dtype=torch.bool)
+    logits, lines = given["logits"][None, :count], given["lines"][:count].unflatten(-1, (-1, 2))[None]
+    truth = OfficialTruth(given["gt_lines"], given["gt_labels"])
+    valid = torch.ones(1, count, dtype=torch.bool)
+    owners = TrackTruth.none(1)
     if case == "tracks":
-        detection[:4], detection[104:], valid[104:] = False, False, False
-        for row, truth in TRACKS.items():
-            continued[row] = truth
-    targets = assign_layer(logits, lines, given["gt_lines"], given["gt_labels"], detection, continued)
-    assert torch.equal(targets.rows, expected[f"{case}/pos_query"])
-    assert torch.equal(targets.truth, expected[f"{case}/pos_gt"])
-    assert torch.equal(targets.labels, expected[f"{case}/target_labels"])
-    close(targets.lines, expected[f"{case}/target_lines"])
-    focal, line = layer_losses(logits, lines, targets, valid)
-    close(focal, expected[f"{case}/loss_cls"])
-    close(line, expected[f"{case}/loss_reg"])
+        valid[:, 104:] = False
+        owners = TrackTruth(*np.full((2, 1, 4), -1))
+        for row, piece in TRACKS.items():
+            owners.kinds[0, row], owners.element_ids[0, row] = truth.kinds[piece], piece
+    outputs = FrameOutputs(
+        layers=[LayerPredictions(logits, lines, None)],
+        queries=torch.zeros(1, count, 1),
+        query_valid=valid,
+        query_track_ids=torch.full((1, count), -1),
+        segmentation=torch.zeros(1, 3, 1, 1),
+        bev=torch.zeros(1, 0, 1, 1),
+        ego_to_global=torch.eye(4, dtype=torch.float64)[None],
+    )
+    matched = match(outputs, truth, owners, PAPER_LOSSES, exclusive=True, unit=torch.ones(2))
+    pairs = matched.layers[-1]
+    assert torch.equal(pairs.row, expected[f"{case}/pos_query"])
+    assert torch.equal(pairs.truth, expected[f"{case}/pos_gt"])
+    labels = torch.full((count,), 3).scatter(0, pairs.row, given["gt_labels"][pairs.truth])
+    assert torch.equal(labels, expected[f"{case}/target_labels"])
+    sums = LossSums()
+    add_layers(sums, outputs, truth, matched, owners.kinds.shape[1], PAPER_LOSSES, torch.ones(2))
+    terms = sums.means(lambda counts: counts)
+    close(terms["focal"], expected[f"{case}/loss_cls"])
+    close(terms["points"], expected[f"{case}/loss_reg"])
 
 
 def test_segmentation_losses(given, expected):
-    focal, dice = segmentation_losses(given["seg_logits"], given["seg_target"])
-    close(focal, expected["seg_focal"])
-    close(dice, expected["seg_dice"])
+    truth = OfficialTruth(given["gt_lines"], given["gt_labels"])
+    truth.targets.segmentation = given["seg_target"].float()
+    terms = segmentation_losses(given["seg_logits"], truth.targets, PAPER_LOSSES)
+    close(terms["segmentation"], expected["seg_focal"])
+    close(terms["segmentation_dice"], expected["seg_dice"])
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
@@ -86,11 +119,12 @@ def test_orders_of_the_truth_are_the_official_ones(kind):
         with np.load(path) as stored:
             arrays = [stored[name] for name in stored.files if name.endswith(f"class{kind}") and len(stored[name])]
         for official in arrays:
-            found = all_orders(torch.from_numpy(official[:, 0]), torch.full((len(official),), kind)).numpy()
-            for ours, theirs in zip(found, official.reshape(*official.shape[:2], -1), strict=True):
-                # The same orders, in whatever order they come; unused ones are far away in both.
-                distance = np.abs(ours[:, None] - theirs[None]).max(axis=-1)
+            orders = torch.from_numpy(official.reshape(*official.shape[:2], -1)).float()
+            lines, owner, _ = Truth.orders(OfficialTruth(orders, torch.full((len(official),), kind)))
+            for number, theirs in enumerate(orders.numpy()):
+                # The same orders, in whatever order they come; their unused ones are far away.
+                ours = lines[0, owner[0] == number].numpy()
                 used = np.abs(theirs).max(axis=-1) < 10
-                assert (distance.min(axis=0)[used] < 1e-6).all()
-                assert (np.abs(ours).max(axis=-1) < 10).sum() >= 2
-                assert (distance.min(axis=1)[np.abs(ours).max(axis=-1) < 10] < 1e-6).all()
+                distance = np.abs(ours[:, None] - theirs[None, used]).max(axis=-1)
+                assert len(ours) == used.sum() == (38 if kind == 0 else 2)
+                assert (distance.min(axis=0) < 1e-6).all() and (distance.min(axis=1) < 1e-6).all()

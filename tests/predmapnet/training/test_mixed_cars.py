@@ -12,17 +12,23 @@ from tiny_clips import tiny_paper_config
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.clips import ClipTraining
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.batches import Batch
 from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.data.draws import Clips, TrainingScenes, step_loader
 from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.loop import Trainer
-from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.settings import Budget, ClipSettings, StreamSettings, TrainingSettings, plan_run
-from predmapnet.training.single_frame import SingleFrameStage
-from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.settings import StreamSettings, choose_stages
+from tests.predmapnet.training.small_runs import (
+    OFTEN,
+    drawn,
+    metrics,
+    nothing_measured,
+    one_process,
+    planned_for,
+    quiet,
+    short_clips,
+)
 
 UNCHANGED = AugmentationSettings(
     photography=PhotographySettings(**dict.fromkeys(PhotographySettings.__dataclass_fields__, 0.0)),
@@ -81,19 +87,11 @@ def test_each_frame_of_a_batch_shows_the_truth_where_its_own_cameras_see_it(tmp_
 @pytest.mark.parametrize("name", ["single", "temporal", "bev", "joint"])
 def test_every_stage_trains_on_cars_of_different_rigs(name, tmp_path):
     torch.manual_seed(0)
-    lite = name in ("single", "temporal")
-    config = tiny_config() if lite else tiny_paper_config()
-    scenes = mixed_scenes(tmp_path, config)
-    network, processes, quiet = PredMapNet(config), ProcessGroup(), lambda _line: None
-    streams = StreamSettings(streams=3, score=0.03, growth_steps=1, longest=6)
-    settings = TrainingSettings(batch=4, log_steps=1, streams=streams)
-    if name == "single":
-        stage = SingleFrameStage(network, scenes, settings, processes)
-    elif name == "temporal":
-        stage = TemporalStage(network, scenes, settings, tmp_path, processes, quiet)
-    else:
-        settings = replace(plan_run(config, name, 1.0, 2, batch=3), clips=ClipSettings(frames=2, span=3))
-        stage = ClipTraining(settings.clip_stages[0][0], network, scenes, settings, processes)
-    trainer = Trainer(network, settings, tmp_path / "run", processes, quiet)
-    assert trainer.run(stage, Budget(steps=2), settings.optimiser, lambda _network, _stage: {})
+    config = tiny_config() if name in ("single", "temporal") else tiny_paper_config()
+    scenes, network = mixed_scenes(tmp_path, config), PredMapNet(config)
+    stage = replace(choose_stages(config, name)[0], streams=StreamSettings(growth_steps=1, longest=6))
+    planned = planned_for(short_clips(stage), steps=2, batch=3)
+    trainer = Trainer(one_process(), network, tmp_path / "run", OFTEN, quiet)
+    assert trainer.run(planned, drawn(planned, network, scenes, tmp_path), nothing_measured)
     assert all(torch.isfinite(value).all() for value in network.state_dict().values())
+    assert all(line["norm"] > 0 for line in metrics(tmp_path / "run"))

@@ -26,9 +26,10 @@ def test_the_average_follows_the_weights() -> None:
     assert network[0].weight.item() == 0.5, "the network itself is left alone"
 
 
-def test_the_rate_warms_up_and_falls_with_the_budget() -> None:
+def test_the_rate_warms_up_stays_and_falls() -> None:
     settings = OptimiserSettings(learning_rate=1.0, warmup_steps=10)
-    assert learning_rate(0, 0.0, settings) == pytest.approx(0.1)
-    assert learning_rate(100, 0.0, settings) == pytest.approx(1.0)
-    assert learning_rate(100, 0.5, settings) == pytest.approx(0.51)
-    assert learning_rate(100, 1.2, settings) == pytest.approx(0.02)
+    assert learning_rate(0, None, 1.0, settings) == pytest.approx(0.1)
+    assert learning_rate(100, None, 1.0, settings) == pytest.approx(1.0)
+    assert learning_rate(100, (50, 150), 1.0, settings) == pytest.approx(0.51)
+    assert learning_rate(160, (50, 150), 1.0, settings) == pytest.approx(0.02)
+    assert learning_rate(40, (50, 150), 2.0, settings) == pytest.approx(2.0)

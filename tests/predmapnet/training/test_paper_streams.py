@@ -1,5 +1,7 @@
 """The prediction loss of Sec. 3.6 where ``lite`` learns in streams: forecasts answer for the frame that comes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,14 +12,13 @@ from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.streams import NO_TRUTH
 from predmapnet.training.data.targets import truth_targets
-from predmapnet.training.process_group import ProcessGroup
-from predmapnet.training.settings import StreamSettings, TrainingSettings
-from predmapnet.training.temporal import TemporalStage
+from predmapnet.training.instants import StageTraining
+from predmapnet.training.settings import LITE_STAGES, TrackRules
 from tests.predmapnet.network.paper_network import bev_levels, pose, tiny_network
 from tests.predmapnet.training.paper_clips import DIVIDER, GRID, forecast_steps, line
 
 STEP = -1.5
-EXACT = StreamSettings(streams=1, score=0.3, track_dropout=0.0, state_dropout=0.0, false_tracks=0)
+EXACT = replace(LITE_STAGES[1], tracks=TrackRules(score=0.3, false_tracks=0))
 
 
 def standing_car(config, offsets, after):
@@ -36,7 +37,7 @@ def standing_car(config, offsets, after):
 @pytest.mark.parametrize(("offsets", "after"), [([3.0], 3.0 + STEP), ([3.0, 3.0 + STEP], None)])
 @pytest.mark.usefixtures("one_thread")
 @torch.no_grad()
-def test_a_forecast_of_the_next_frame_costs_nothing_and_one_of_this_frame_its_distance(tmp_path, offsets, after):
+def test_a_forecast_of_the_next_frame_costs_nothing_and_one_of_this_frame_its_distance(offsets, after):
     network = tiny_network("lite", decoder={"points": 20}).train()
     size = torch.tensor([network.config.roi_length, network.config.roi_width])
     guess = network.query_generator.first_guess[-1]
@@ -45,12 +46,11 @@ def test_a_forecast_of_the_next_frame_costs_nothing_and_one_of_this_frame_its_di
     for layer in network.map_decoder.layers:
         for parameter in [*layer.move.parameters(), *layer.classify.parameters()]:
             parameter.zero_()
-    settings = TrainingSettings(streams=EXACT)
     costs = []
     for step in (STEP, 0.0):
         forecast_steps(network, (0.0, step))
-        stage = TemporalStage(network, None, settings, tmp_path, ProcessGroup())
-        costs.append(float(stage.losses(0, standing_car(network.config, offsets, after))["forecast"]))
+        training = StageTraining(network, EXACT)
+        costs.append(float(training(standing_car(network.config, offsets, after), 0)["forecast"]))
     assert costs[0] == pytest.approx(0.0, abs=1e-3)
     both_kinds = 2 * abs(STEP)  # The chamfer distance, and point by point.
-    assert costs[1] == pytest.approx(settings.weights.forecast * both_kinds / len(offsets), rel=1e-2)
+    assert costs[1] == pytest.approx(EXACT.losses.forecast * both_kinds / len(offsets), rel=1e-2)

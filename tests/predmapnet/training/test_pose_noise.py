@@ -49,7 +49,7 @@ def state():
 def test_noise_is_one_per_frame_and_leaves_the_height(state):
     now = state.ego_to_global.clone()
     now[:, 0, 3] += 2.0
-    noisy = with_pose_noise(state, now, 0.1, 0.3, torch.Generator().manual_seed(1))
+    noisy = with_pose_noise(state, now, 0.1, 0.3, [torch.Generator().manual_seed(seed) for seed in (1, 2)])
     moved = relative_pose(noisy.ego_to_global, now)
     assert (moved[:, 0, 3] + 2.0).abs().max() < 2.0
     assert not torch.allclose(moved[0], moved[1])
@@ -63,6 +63,6 @@ def test_noise_is_one_per_frame_and_leaves_the_height(state):
 def test_no_noise_is_no_change(state):
     now = state.ego_to_global.clone()
     now[:, 1, 3] -= 3.0
-    same = with_pose_noise(state, now, 0.0, 0.0, torch.Generator())
+    same = with_pose_noise(state, now, 0.0, 0.0, [torch.Generator()] * 2)
     assert torch.allclose(same.ego_to_global, state.ego_to_global)
     assert torch.allclose(same.vector_memory.poses, state.vector_memory.poses)

@@ -1,169 +1,154 @@
 """A run that dies and goes on gives the same steps, losses and weights as one that never stopped."""
 
-from __future__ import annotations
+from dataclasses import replace
 
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
-import orjson
 import pytest
 import torch
-from painted_scenes import painted_scenes, tiny_config
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.prepare import DataOptions, DataSet
 from predmapnet.training.loop import Trainer
-from predmapnet.training.process_group import ProcessGroup
+from predmapnet.training.plan import PlanOptions
 from predmapnet.training.run import RunOptions, train_network
-from predmapnet.training.settings import Budget, StreamSettings, TrainingSettings
-from predmapnet.training.single_frame import SingleFrameStage
-from predmapnet.training.temporal import TemporalStage
-
-SETTINGS = TrainingSettings(
-    batch=2,
-    single=Budget(steps=5),
-    temporal=Budget(steps=6),
-    checkpoint_minutes=0.0,
-    log_steps=1,
-    # Scores of an untrained network are low; tracks must exist for their state to matter.
-    streams=StreamSettings(streams=2, score=0.03, growth_steps=1, longest=6),
+from predmapnet.training.settings import LITE_STAGES, StreamSettings
+from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
+from tests.predmapnet.training.paper_clips import JOINT, PlainBackbone
+from tests.predmapnet.training.small_runs import (
+    OFTEN,
+    Cut,
+    PowerCutError,
+    drawn,
+    metrics,
+    nothing_measured,
+    one_process,
+    planned_for,
+    quiet,
+    short_clips,
 )
+from tests.predmapnet.training.tiny_clips import tiny_paper_config
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
+SINGLE, TEMPORAL = LITE_STAGES
+STEPS = 4
+STAGES = {
+    "single": SINGLE,
+    # Scores of an untrained network are low; tracks must exist for their state to matter.
+    "temporal": replace(
+        TEMPORAL,
+        tracks=replace(TEMPORAL.tracks, score=0.03),
+        streams=StreamSettings(growth_steps=1, longest=6),
+    ),
+    "joint": short_clips(JOINT),
+}
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> TrainingScenes:
-    return painted_scenes(tmp_path_factory.mktemp("scenes"), 6, tiny_config())
+def scenes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+    lite = painted_scenes(folder / "lite", 6, tiny_config())
+    return {"single": lite, "temporal": lite, "joint": painted_scenes(folder, 5, tiny_paper_config(), (DEMO_RIG,))}
 
 
-def one_town(folder: Path) -> DataOptions:
-    return DataOptions((DataSet("demo"),), folder / "cache", towns=1, validation=1)
-
-
-class PowerCutError(Exception):
-    pass
-
-
-def run(folder: Path, scenes: TrainingScenes, resume: bool = False, cut_at: tuple[str, int] | None = None) -> Trainer:
+def run(folder, scenes, name, resume=False, cut_at=None):
     torch.manual_seed(3)
-    network = PredMapNet(tiny_config())
-    trainer = Trainer(network, SETTINGS, folder, ProcessGroup(), lambda _line: None)
+    network = PredMapNet(scenes[name].config)
+    if name == "joint":
+        network.image_backbone = PlainBackbone(network.config.backbone.channels)
+        torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
+    trainer = Trainer(one_process(), network, folder, OFTEN, quiet)
     if resume:
         trainer.resume()
-    single = SingleFrameStage(network, scenes, SETTINGS, ProcessGroup())
-    temporal = TemporalStage(network, scenes, SETTINGS, folder, ProcessGroup(), lambda _line: None)
-    for stage, budget in ((single, SETTINGS.single), (temporal, SETTINGS.temporal)):
-        if cut_at is not None and stage.name == cut_at[0]:
-            cut(stage, cut_at[1])
-        assert budget is not None
-        trainer.run(stage, budget, SETTINGS.optimiser, lambda _network, _stage: {"mAP": 0.0})
+        torch.manual_seed(99)  # Another process has drawn other numbers so far.
+    planned = planned_for(STAGES[name], STEPS, batch=2)
+    data = drawn(planned, trainer.result, scenes[name], folder)
+    trainer.run(planned, data if cut_at is None else Cut(data, cut_at), nothing_measured)
     return trainer
 
 
-def cut(stage: Any, at_step: int) -> None:
-    whole = stage.losses
-
-    def losses(step: int, batch: Any) -> dict[str, torch.Tensor]:
-        if step == at_step:
-            raise PowerCutError
-        return whole(step, batch)
-
-    stage.losses = losses
-
-
-def metrics(folder: Path) -> list[dict[str, Any]]:
-    times = ("seconds", "cpu_seconds", "seconds_per_step")
-    lines = [orjson.loads(line) for line in (folder / "metrics.jsonl").read_bytes().splitlines()]
-    return [{name: value for name, value in line.items() if name not in times} for line in lines]
-
-
-@pytest.mark.parametrize("cut_at", [("single", 3), ("temporal", 3)])
-def test_a_run_that_died_goes_on_as_if_nothing_had_happened(
-    tmp_path: Path, scenes: TrainingScenes, cut_at: tuple[str, int]
-) -> None:
-    straight = run(tmp_path / "straight", scenes)
+@pytest.mark.parametrize("name", STAGES)
+def test_a_run_that_died_goes_on_as_if_nothing_had_happened(tmp_path, scenes, name):
+    config = scenes[name].config
+    assert name != "joint" or config.decoder.dropout == config.bev.dropout == 0.1
+    straight = run(tmp_path / "straight", scenes, name)
     with pytest.raises(PowerCutError):
-        run(tmp_path / "cut", scenes, cut_at=cut_at)
-    resumed = run(tmp_path / "cut", scenes, resume=True)
+        run(tmp_path / "cut", scenes, name, cut_at=2)
+    with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
+        file.write('{"stage": "a line of a step that no checkpoint knows"}\n')
+    resumed = run(tmp_path / "cut", scenes, name, resume=True)
     assert metrics(tmp_path / "cut") == metrics(tmp_path / "straight")
-    assert any("forecast" in line and line["forecast"] > 0 for line in metrics(tmp_path / "cut")), "tracks were alive"
-    for network in ("network", "average"):
-        first = getattr(straight, network)
-        second = getattr(resumed, network)
-        for whole, again in zip(
-            (first if network == "network" else first.network).state_dict().values(),
-            (second if network == "network" else second.network).state_dict().values(),
-            strict=True,
-        ):
-            assert torch.equal(whole, again)
+    assert len(metrics(tmp_path / "cut")) == STEPS
+    if name == "temporal":
+        assert any(line["forecast"] > 0 for line in metrics(tmp_path / "cut")), "tracks were alive"
+    for one, other in ((straight.network, resumed.network), (straight.result, resumed.result)):
+        assert all(torch.equal(value, other.state_dict()[key]) for key, value in one.state_dict().items())
 
 
-def test_only_the_newest_checkpoint_stays_and_half_of_one_is_ignored(tmp_path: Path, scenes: TrainingScenes) -> None:
-    run(tmp_path, scenes)
-    assert len(list(tmp_path.glob("step-*"))) == 1
-    (tmp_path / ".step-099999999.partial").mkdir()
+def test_dropout_draws_other_numbers_for_another_seed(tmp_path, scenes):
+    """Otherwise the test above would prove nothing."""
+    found = []
+    for seed in (0, 1):
+        torch.manual_seed(0)
+        trainer = Trainer(one_process(), PredMapNet(scenes["joint"].config), tmp_path / f"{seed}", OFTEN, quiet)
+        trainer.network.image_backbone = PlainBackbone(32)
+        training, _ = trainer._begin(STAGES["joint"])
+        planned = planned_for(STAGES["joint"], STEPS, batch=2)
+        segment = next(drawn(planned, trainer.network, scenes["joint"], tmp_path).segments(0))
+        if seed:
+            torch.manual_seed(seed)
+        found.append(float(training(segment, 0)["points"].detach()))
+    assert found[0] != pytest.approx(found[1], rel=1e-6)
+
+
+def test_the_last_three_checkpoints_stay_and_half_of_one_is_ignored(tmp_path, scenes):
+    run(tmp_path, scenes, "single")
+    assert [path.name for path in sorted(tmp_path.glob("frames-*"))] == [f"frames-{f:012d}" for f in (4, 6, 8)]
+    (tmp_path / ".frames-000000000099.partial").mkdir()
     newest = run_checkpoint.latest(tmp_path)
     assert newest is not None
-    assert run_checkpoint.read_json(newest / "position.json")["finished"] == ["single", "temporal"]
+    assert run_checkpoint.read_position(newest).finished == ["single"]
 
 
-def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path: Path, scenes: TrainingScenes) -> None:
+def test_resuming_from_nothing_or_from_damage_is_the_users_to_mend(tmp_path, scenes):
     with pytest.raises(UserError, match="no checkpoint"):
-        run(tmp_path / "empty", scenes, resume=True)
-    run(tmp_path / "damaged", scenes)
+        run(tmp_path / "empty", scenes, "single", resume=True)
+    run(tmp_path / "damaged", scenes, "single")
     newest = run_checkpoint.latest(tmp_path / "damaged")
     assert newest is not None
     (newest / "network.safetensors").write_bytes(b"cut short")
     with pytest.raises(UserError, match="damaged"):
-        run(tmp_path / "damaged", scenes, resume=True)
+        run(tmp_path / "damaged", scenes, "single", resume=True)
+    (newest / "position.json").write_text('{"stage": "single", "steps": 3}')
+    with pytest.raises(UserError, match="another version"):
+        run(tmp_path / "damaged", scenes, "single", resume=True)
 
 
-def test_streams_of_an_older_version_go_on_without_their_past(tmp_path: Path, scenes: TrainingScenes) -> None:
-    network = PredMapNet(tiny_config())
-    stage = TemporalStage(network, scenes, SETTINGS, tmp_path, ProcessGroup())
-    whole = stage.state()
-    older = {name.removeprefix("state."): value for name, value in whole.items() if name.startswith("state.instances.")}
-    older |= {name: value for name, value in whole.items() if name.startswith("owners.")}
-    older |= {"plan.frame": torch.ones(2).long(), "owners.kinds": torch.ones(2, 3).long()}
-    stage.restore(older)
-    assert stage.state()["owners.kinds"].shape == (2, 0)
+def options(folder, **changes):
+    towns = DataOptions((DataSet("demo"),), folder / "cache", towns=1, validation=1)
+    return RunOptions(**({"config": tiny_config(), "data": towns, "folder": folder, "loop": OFTEN} | changes))
 
 
-def test_a_gpu_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    if torch.cuda.is_available():
-        pytest.skip("there is one")
-    common = {"config": tiny_config(), "data": one_town(tmp_path), "folder": tmp_path / "run"}
-    sizes = {"processes": 1, "threads": 1}
-    with pytest.raises(UserError, match="no device cuda"):
-        train_network(RunOptions(**common, **sizes, settings=SETTINGS, device="cuda"))
+def test_gpus_that_are_not_there_are_refused_before_anything_is_made(tmp_path):
+    missing = torch.cuda.device_count() + 1
+    with pytest.raises(UserError, match=rf"GPUs here, not {missing}"):
+        train_network(options(tmp_path / "run", device="cuda", plan=PlanOptions(devices=missing)))
     assert not list(tmp_path.iterdir())
 
 
-def test_weights_that_do_not_fit_are_refused_before_anything_is_rendered(
-    tmp_path: Path, scenes: TrainingScenes
-) -> None:
-    run(tmp_path / "run", scenes)
+def test_weights_that_do_not_fit_are_refused_before_anything_is_rendered(tmp_path, scenes):
+    run(tmp_path / "run", scenes, "single")
     wider = PredMapNetConfig.model_validate(tiny_config().model_dump() | {"decoder": {"width": 64}})
-    common = {"data": one_town(tmp_path), "settings": SETTINGS}
-    sizes = {"processes": 1, "threads": 1}
     for config, folder, start, says in (
         (wider, "run", {"resume": True}, r"do not fit the network .*\(\d+ tensors: .* instead of"),
         (tiny_config(), "empty", {"resume": True}, "no checkpoint"),
         (tiny_config(), "new", {"initial": tmp_path / "absent.safetensors"}, "absent"),
+        (tiny_config(), "new", {"stage": "temporal"}, "needs a network that sees"),
+        (tiny_config(), "run", {}, "holds a run already"),
     ):
         with pytest.raises(UserError, match=says) as caught:
-            train_network(RunOptions(**common, **sizes, config=config, folder=tmp_path / folder, **start))
+            train_network(options(tmp_path / folder, config=config, **start))
         assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -11,14 +11,15 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.network.state import FrameOutputs, LayerPredictions
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.targets import Targets, truth_targets
-from predmapnet.training.losses.lite import LossWeights, frame_losses
-from predmapnet.training.losses.matching import Assignment, MatchingCosts
-from predmapnet.training.settings import StreamSettings
-from predmapnet.training.track_truth import TrackTruth, choose_tracks, truth_of_tracks
+from predmapnet.training.losses.frame import LossSums, add_layers
+from predmapnet.training.losses.matching import Matched, Truth, match
+from predmapnet.training.losses.weights import LITE_LOSSES
+from predmapnet.training.settings import TrackRules
+from predmapnet.training.track_truth import Chosen, TrackTruth, choose_tracks
 
 ROI = RegionOfInterest()
 SIZE = torch.tensor([60.0, 30.0])
-CALM = StreamSettings(track_dropout=0.0, false_tracks=0, refresh=0.0)
+CALM = TrackRules(score=0.3, false_tracks=0)
 
 
 def lines_at(*heights: float) -> Targets:
@@ -45,35 +46,44 @@ def outputs_at(heights: list[float], scores: list[float]) -> FrameOutputs:
 
 
 def owners_of(*element_ids: int) -> TrackTruth:
-    ids = torch.tensor([element_ids])
-    return TrackTruth(torch.where(ids >= 0, 1, -1), ids)
+    ids = np.array([element_ids])
+    return TrackTruth(np.where(ids >= 0, 1, -1), ids)
+
+
+def matched(
+    outputs: FrameOutputs, targets: Targets, owners: TrackTruth, exclusive: bool = False
+) -> tuple[Matched, Truth]:
+    truth = Truth(targets, torch.device("cpu"), SIZE)
+    return match(outputs, truth, owners, LITE_LOSSES, exclusive, SIZE), truth
+
+
+def pairs(
+    outputs: FrameOutputs, targets: Targets, owners: TrackTruth, exclusive: bool = False
+) -> list[tuple[int, int]]:
+    found = matched(outputs, targets, owners, exclusive)[0].layers[-1]
+    return list(zip(found.row.tolist(), found.truth.tolist(), strict=True))
 
 
 def test_a_track_answers_for_its_owner_even_if_another_truth_is_nearer() -> None:
-    targets = lines_at(0.0, 5.0)
-    outputs = outputs_at([4.9, 0.1], [0.9, 0.9])
-    points = outputs.layers[-1].points
-    assert points is not None
-    pairs = truth_of_tracks(owners_of(10, 77), outputs.query_valid, points, targets, SIZE)
-    assert (pairs.row.tolist(), pairs.truth.tolist()) == ([0], [0]), "row 1's element is gone: background"
+    found = pairs(outputs_at([4.9, 0.1], [0.9, 0.9]), lines_at(0.0, 5.0), owners_of(10, 77))
+    assert found == [(0, 0)], "row 1's element is gone: background"
 
 
 def test_of_several_pieces_the_nearest_counts() -> None:
     targets = replace(lines_at(0.0, 5.0), element_ids=torch.tensor([10, 10]))
-    outputs = outputs_at([4.0], [0.9])
-    points = outputs.layers[-1].points
-    assert points is not None
-    assert truth_of_tracks(owners_of(10), outputs.query_valid, points, targets, SIZE).truth.tolist() == [1]
+    assert pairs(outputs_at([4.0], [0.9]), targets, owners_of(10)) == [(0, 1)]
 
 
-def test_detections_keep_the_truth_that_tracks_own() -> None:
-    targets = lines_at(0.0, 5.0)
-    outputs = outputs_at([0.0, 0.2, 5.2], [0.9, 0.5, 0.5])
-    tracks = Assignment(torch.tensor([0]), torch.tensor([0]), torch.tensor([0]))
-    found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts(), tracks, track_rows=1)
-    assert sorted(zip(found.assignment.row.tolist(), found.assignment.truth.tolist(), strict=True)) == [
-        (0, 0), (1, 0), (2, 1),
-    ]  # fmt: skip
+def test_detections_keep_the_truth_that_tracks_own_unless_tracks_suppress_them() -> None:
+    outputs, targets = outputs_at([0.0, 0.2, 5.2], [0.9, 0.5, 0.5]), lines_at(0.0, 5.0)
+    assert pairs(outputs, targets, owners_of(10)) == [(0, 0), (1, 0), (2, 1)]
+    assert pairs(outputs, targets, owners_of(10), exclusive=True) == [(0, 0), (2, 1)]
+
+
+def test_two_tracks_of_one_piece_both_answer_for_it_unless_that_is_exclusive() -> None:
+    outputs, targets = outputs_at([0.0, 0.2], [0.9, 0.5]), lines_at(0.0)
+    assert pairs(outputs, targets, owners_of(10, 10)) == [(0, 0), (1, 0)]
+    assert pairs(outputs, targets, owners_of(10, 10), exclusive=True) == [(0, 0)]
 
 
 def test_a_track_without_owner_is_pushed_towards_background() -> None:
@@ -82,52 +92,57 @@ def test_a_track_without_owner_is_pushed_towards_background() -> None:
     logits = outputs.layers[-1].logits
     assert logits is not None
     logits.requires_grad_(True)
-    nobody = Assignment(*torch.zeros((3, 0), dtype=torch.int64))
-    found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts(), nobody, track_rows=1)
-    found.total.backward()
+    found, truth = matched(outputs, targets, owners_of(77))
+    sums = LossSums()
+    add_layers(sums, outputs, truth, found, 1, LITE_LOSSES, SIZE)
+    sums.means(lambda counts: counts)["focal"].backward()
     assert logits.grad is not None
     assert logits.grad[0, 0, 1] > 0 > logits.grad[0, 1, 1]
 
 
-def choose(heights: list[float], scores: list[float], owners: TrackTruth, targets: Targets, settings: StreamSettings):
-    outputs = outputs_at(heights, scores)
-    rows = owners.kinds.shape[1]
-    points = outputs.layers[-1].points
-    assert points is not None
-    tracks = truth_of_tracks(owners, outputs.query_valid[:, :rows], points[:, :rows], targets, SIZE)
-    found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts(), tracks, rows)
-    return choose_tracks(outputs, rows, owners, found.assignment, targets, settings, np.random.default_rng(0))
+def choose(
+    heights: list[float],
+    scores: list[float],
+    owners: TrackTruth,
+    targets: Targets,
+    rules: TrackRules = CALM,
+    seed: int = 0,
+) -> Chosen:
+    found, truth = matched(outputs_at(heights, scores), targets, owners)
+    draws = [np.random.default_rng(seed)]
+    return choose_tracks(found.scores, found.valid, found.truth, owners, truth.kinds, truth.element_ids, rules, draws)
 
 
 def test_scores_choose_and_truth_names_the_owner() -> None:
     targets = lines_at(0.0, 5.0, -5.0)
     # Rows: a good track, a weak track, a detection of the first's truth, a newborn, a weak newborn.
-    chosen = choose([0, 5, 0.1, 5.1, -5], [0.8, 0.2, 0.9, 0.7, 0.1], owners_of(10, 11), targets, CALM)
+    chosen = choose([0, 5, 0.1, 5.1, -5], [0.8, 0.2, 0.9, 0.7, 0.1], owners_of(10, 11), targets)
     assert chosen.rows.tolist() == [[0, 3]]
     assert chosen.identity.tolist() == [[0, -1]]
-    assert chosen.track_truth.element_ids.tolist() == [[10, 11]]
+    assert chosen.owners.element_ids.tolist() == [[10, 11]]
+    assert chosen.truth.tolist() == [[0, 1]]
 
 
 def test_a_better_detection_refreshes_its_track() -> None:
-    always = replace(CALM, refresh=1.0)
-    chosen = choose([0.0, 0.1], [0.6, 0.9], owners_of(10), lines_at(0.0), always)
+    chosen = choose([0.0, 0.1], [0.6, 0.9], owners_of(10), lines_at(0.0), replace(CALM, refresh=1.0))
     assert chosen.rows.tolist() == [[1]]
     assert chosen.identity.tolist() == [[0]]
 
 
 def test_false_tracks_belong_to_nobody_and_stay_so() -> None:
     targets = lines_at(0.0)
-    born = None
-    for seed in range(5):
-        outputs = outputs_at([0.0, 9.0], [0.9, 0.8])
-        found = frame_losses(outputs, targets, SIZE, LossWeights(), MatchingCosts())
-        settings = replace(CALM, false_tracks=1)
-        born = choose_tracks(
-            outputs, 0, TrackTruth.none(1), found.assignment, targets, settings, np.random.default_rng(seed)
-        )
-        if born.rows.shape[1] == 2:
-            break
-    assert born is not None
-    assert born.track_truth.element_ids.tolist() == [[10, -1]]
-    later = choose([0.0, 5.0], [0.9, 0.9], born.track_truth, lines_at(0.0, 5.0), CALM)
-    assert later.track_truth.element_ids.tolist() == [[10, -1]]
+    born = [
+        choose([0.0, 9.0], [0.9, 0.8], TrackTruth.none(1), targets, replace(CALM, false_tracks=1), s) for s in (0, 1, 2)
+    ]
+    assert {chosen.rows.shape[1] for chosen in born} == {1, 2}
+    both = next(chosen for chosen in born if chosen.rows.shape[1] == 2)
+    assert both.owners.element_ids.tolist() == [[10, -1]]
+    later = choose([0.0, 5.0], [0.9, 0.9], both.owners, lines_at(0.0, 5.0))
+    assert later.owners.element_ids.tolist() == [[10, -1]]
+    everyone = choose([9.0, 0.0, 8.0], [0.8, 0.9, 0.1], TrackTruth.none(1), targets, replace(CALM, false_tracks=None))
+    assert everyone.rows.tolist() == [[0, 1]], "all confident ones, in their order"
+
+
+def test_no_more_tracks_than_there_is_room_for_and_the_best_stay() -> None:
+    chosen = choose([0.0, 5.0], [0.6, 0.9], TrackTruth.none(1), lines_at(0.0, 5.0), replace(CALM, capacity=1))
+    assert chosen.rows.tolist() == [[1]]

@@ -6,8 +6,8 @@ import torch
 from mapfusion.elements import RegionOfInterest
 from predmapnet.network.ego_motion import move_points, plane_motion
 from predmapnet.network.maptracker.motion_mlp import MotionMlp
-from predmapnet.training.losses.lite import focal_loss
-from predmapnet.training.losses.maptracker import CLASS_WEIGHT, TRANSFORMATION_WEIGHT, transformation_loss
+from predmapnet.training.losses.terms import focal_loss, transformation_losses
+from predmapnet.training.losses.weights import PAPER_LOSSES
 
 ROI = RegionOfInterest()
 POINTS, BACKGROUND = 4, 3
@@ -35,13 +35,17 @@ def read_out(queries):
 
 def loss(lines, labels, metres, tracks=None, motion=None):
     tracks = lines if tracks is None else tracks
-    return transformation_loss(motion or ByTheCar(), read_out, tracks, labels, lines, motion_by(metres), ROI)
+    points = lines.unflatten(-1, (-1, 2))
+    of_lines, of_classes = transformation_losses(
+        motion or ByTheCar(), read_out, tracks, labels, points, motion_by(metres)[: len(tracks)], ROI, PAPER_LOSSES
+    )
+    return of_lines / (labels < BACKGROUND).sum().clamp(min=1) + of_classes / max(len(labels), 1)
 
 
 def classes_alone(labels):
     wanted = torch.nn.functional.one_hot(labels, 4)[:, :3].float()
     focal = focal_loss(read_out(torch.zeros(2, 8))[0], wanted).sum() / 2
-    return 2 * TRANSFORMATION_WEIGHT * CLASS_WEIGHT * float(focal)
+    return 2 * 0.1 * 5.0 * float(focal)
 
 
 @pytest.mark.parametrize("metres", [-3.0, 0.0, 6.0])
@@ -74,5 +78,4 @@ def test_it_teaches_the_motion_and_no_track_is_no_loss():
     loss(torch.rand(2, 2 * POINTS), labels, 1.0, motion=motion).backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in motion.parameters())
     none = torch.zeros(0, 2 * POINTS)
-    nothing = transformation_loss(motion, read_out, none, labels[:0], none, motion_by(1.0)[:0], ROI)
-    assert float(nothing) == 0.0
+    assert float(loss(none, labels[:0], 1.0, motion=motion)) == 0.0

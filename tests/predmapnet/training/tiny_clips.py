@@ -6,16 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from painted_scenes import painted_scene
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.calibration import collate_calibrations
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs
 from predmapnet.presets import preset
-from predmapnet.training.clip_losses import ClipFrame
+from predmapnet.training.data.batches import Batch
 from predmapnet.training.data.targets import truth_targets
+from tests.predmapnet.training.painted_scenes import painted_scene
 
 GRID = (100, 200)
 
@@ -44,7 +42,7 @@ def tiny_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
     return network
 
 
-def painted_clip(folder: Path, config: PredMapNetConfig, frames: int, streams: int = 2) -> list[ClipFrame]:
+def painted_clip(folder: Path, config: PredMapNetConfig, frames: int, streams: int = 2) -> list[Batch]:
     """The first frames of painted scenes, with random depth."""
     scenes = [painted_scene(folder / f"scene-{seed}", frames, seed, config) for seed in range(streams)]
     generator = torch.Generator().manual_seed(0)
@@ -52,14 +50,15 @@ def painted_clip(folder: Path, config: PredMapNetConfig, frames: int, streams: i
     for index in range(frames):
         loaded = [scene.frame(index) for scene in scenes]
         images = torch.from_numpy(np.stack([frame.images for frame in loaded]))
-        inputs = FrameInputs(
-            images=normalise_images(images, config.image),
-            camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
-            ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
-            calibration=collate_calibrations([frame.calibration for frame in loaded]),
-        )
         cells = (streams, images.shape[1], config.image.height // 8, config.image.width // 8)
-        depth = torch.randint(-1, config.depth.bins, cells, generator=generator)
-        targets = truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, GRID)
-        clip.append(ClipFrame(inputs, targets, depth))
+        clip.append(
+            Batch(
+                images=images,
+                camera_valid=torch.ones(images.shape[:2], dtype=torch.bool),
+                ego_to_global=torch.from_numpy(np.stack([frame.ego_to_global for frame in loaded])),
+                calibration=collate_calibrations([frame.calibration for frame in loaded]),
+                targets=truth_targets([frame.truth for frame in loaded], config.roi, config.decoder.points, GRID),
+                depth=torch.randint(-1, config.depth.bins, cells, generator=generator),
+            )
+        )
     return clip

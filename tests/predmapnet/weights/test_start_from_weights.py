@@ -8,7 +8,7 @@ import torch
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.run_checkpoint import start_from
+from predmapnet.weights.fit import start_from
 from predmapnet.weights.inspection import parts_of
 from tests.predmapnet.network.small_baseline import small_config
 

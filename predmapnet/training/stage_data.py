@@ -1,0 +1,52 @@
+"""What one process sees of a stage's data, step after step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import count
+from zlib import crc32
+
+import torch
+
+from predmapnet.training.data.batches import StreamSegment
+from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips, TrainingScenes, step_loader
+from predmapnet.training.data.streams import FeatureStore, Streams
+from predmapnet.training.plan import PlannedStage
+
+
+class StageData:
+    """Segments of frames, each of which is seen at once; a step takes as many as it has parts."""
+
+    def __init__(
+        self,
+        planned: PlannedStage,
+        scenes: TrainingScenes,
+        seed: int,
+        rank: int = 0,
+        size: int = 1,
+        workers: int = 0,
+        store: FeatureStore | None = None,
+    ) -> None:
+        """Choose a stage, its scenes, which process of how many, and for streams where their features are."""
+        stage, seeds = planned.stage, (seed, crc32(planned.stage.name.encode()))
+        self._batch, self._place, self._workers = planned.batch // planned.parts, (rank, size), workers
+        if store is not None:
+            streams = replace(stage.streams, streams=planned.share)
+            self._drawn: Streams | Clips = Streams(scenes, store, streams, stage.augmentation, seeds, rank, size)
+        elif stage.data == "frames":
+            self._drawn = Clips(scenes, stage.augmentation, seeds, crossing_weight=CROSSING_WEIGHT)
+        else:
+            self._drawn = Clips(scenes, stage.augmentation, seeds, stage.clips.frames, stage.clips.span)
+
+    def segments(self, first: int) -> Iterator[StreamSegment]:
+        """Yield them without an end, from number ``first`` on."""
+        if isinstance(self._drawn, Streams):
+            return map(self._drawn.__getitem__, count(first))
+        # The loader draws a seed for its workers, which must not come out of those of dropout.
+        with torch.random.fork_rng(devices=()):
+            return iter(step_loader(self._drawn, self._batch, first, *self._place, self._workers))
+
+    def name(self, number: int) -> str:
+        """Say which frames a segment holds."""
+        return f"number {number}"
