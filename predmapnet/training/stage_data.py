@@ -49,4 +49,9 @@ class StageData:
 
     def name(self, number: int) -> str:
         """Say which frames a segment holds."""
-        return f"number {number}"
+        if isinstance(self._drawn, Streams):
+            return self._drawn.name(number)
+        rank, size = self._place
+        own = self._batch // size
+        first = number * self._batch + rank * own
+        return ", ".join(self._drawn.name(draw) for draw in range(first, first + own))

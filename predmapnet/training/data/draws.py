@@ -135,6 +135,11 @@ class Clips(Dataset[list[CachedFrame]]):
         loaded = (self._scenes.load(scene, number, mirrored) for number in numbers)
         return [augment(frame, self._augmentation, self._scenes.config.image, generator, bump) for frame in loaded]
 
+    def name(self, draw: int) -> str:
+        """Say which frame a clip ends with."""
+        scene, last = self._index[self._order[draw]].tolist()
+        return f"{self._scenes.scenes[scene].folder.name} frame {last}"
+
     def collate(self, clips: Sequence[Sequence[CachedFrame]]) -> StreamSegment:
         """Put clips side by side."""
         return StreamSegment([collate_frames(frames, self._scenes.config) for frames in zip(*clips, strict=True)])

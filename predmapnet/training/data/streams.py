@@ -120,6 +120,12 @@ class Streams(Dataset[StreamSegment]):
         after = truth_targets(following, config.roi, config.decoder.points, None)
         return StreamSegment(instants, features, torch.from_numpy(fresh > 0), after)
 
+    def name(self, step: int) -> str:
+        """Say with which frames the streams of a step begin."""
+        scenes, frames = self._stands[step + 1][:2, self._own].tolist()
+        named = [self._scenes.scenes[scene].folder.name for scene in scenes]
+        return ", ".join(f"{name} frame {frame}" for name, frame in zip(named, frames, strict=True))
+
     def _go_on(self) -> None:
         """Add where the streams stand a step later; where a drive is over, a new one begins."""
         count, step = self._settings.frames, len(self._stands) - 1
