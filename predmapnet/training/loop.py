@@ -135,7 +135,7 @@ class Trainer:
                 terms, norm = self._step(module, optimiser, parts, rate, stage)
                 if math.isfinite(norm):
                     bad = 0
-                    meter.add(terms, torch.tensor(norm, device=self._fabric.device))
+                    meter.add(terms, norm)
                 else:
                     bad += 1
                     first = position.step * planned.parts
@@ -147,6 +147,7 @@ class Trainer:
                 progress = position.step / fall[1] if fall else seconds / (60 * (planned.minutes or 1))
                 if position.step % settings.log_steps == 0 or done:
                     self._log.write({"lr": rate, **meter.means(self._mean)}, position, progress)
+                    meter = Meter()
                 if (done and not interrupted) or int(progress * VALIDATIONS) > position.validated:
                     position.validated = int(progress * VALIDATIONS)
                     self._validate(validate, stage, progress)

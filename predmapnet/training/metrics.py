@@ -17,34 +17,28 @@ from predmapnet.training.settings import Report
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
-METRICS = "metrics.jsonl"
-
 
 class Meter:
-    """Means of the losses since the last line. They stay on their device until they are asked for."""
+    """Means of the losses since it was made. They stay on their device until they are asked for."""
 
     def __init__(self) -> None:
-        self._sums: Tensor | None = None
-        self._names: list[str] = []
-        self._count = 0
-        self._since = time.monotonic()
+        self._sums: dict[str, Tensor] = {}
+        self._count, self._since = 0, time.monotonic()
 
-    def add(self, terms: Mapping[str, Tensor], norm: Tensor) -> None:
+    def add(self, terms: Mapping[str, Tensor], norm: float) -> None:
         """Add the losses of a step, and the norm of its gradient."""
-        self._names = [*terms, "norm"]
-        values = torch.stack([value.detach() for value in (*terms.values(), norm)])
-        self._sums = values if self._sums is None else self._sums + values
+        total = torch.stack(list(terms.values())).sum()
+        for name, value in {"loss": total, **terms, "norm": torch.full_like(total, norm)}.items():
+            self._sums[name] = self._sums.get(name, torch.zeros_like(value)) + value.detach()
         self._count += 1
 
     def means(self, shared: Callable[[Tensor], Tensor]) -> dict[str, float]:
-        """Return the means, averaged over all processes by ``shared``, and begin anew."""
-        found: dict[str, float] = {}
-        if self._sums is not None:
-            values = (shared(self._sums) / self._count).tolist()
-            found = {"loss": sum(values[:-1]), **dict(zip(self._names, values, strict=True))}
+        """Return the means, averaged over all processes by ``shared``."""
+        values: list[float] = []
+        if self._sums:
+            values = (shared(torch.stack(list(self._sums.values()))) / self._count).tolist()
         seconds = (time.monotonic() - self._since) / max(self._count, 1)
-        self.__init__()  # type: ignore[misc]
-        return {**found, "seconds_per_step": seconds}
+        return {**dict(zip(self._sums, values, strict=True)), "seconds_per_step": seconds}
 
 
 class MetricsLog:
@@ -52,9 +46,9 @@ class MetricsLog:
 
     def __init__(self, folder: Path, leads: bool, report: Report) -> None:
         """Write to ``folder``, if this process leads."""
-        self._path, self._leads, self._report = folder / METRICS, leads, report
+        self._path, self._leads, self._report = folder / "metrics.jsonl", leads, report
         self._board: SummaryWriter | None = None
-        self._board_missing = not leads
+        self._board_missing = False
 
     @property
     def size(self) -> int:
@@ -71,14 +65,10 @@ class MetricsLog:
         """Append one line of metrics and show it."""
         if not self._leads:
             return
-        line = {
-            "stage": position.stage,
-            "step": position.step,
-            "frames": position.frames,
-            "seconds": round(position.total_seconds + position.seconds, 1),
-            "cpu_seconds": round(position.cpu_seconds, 1),
-            **{name: round(value, 5) for name, value in values.items()},
-        }
+        line: dict[str, object] = {name: getattr(position, name) for name in ("stage", "step", "frames")}
+        line |= {"seconds": round(position.total_seconds + position.seconds, 1)}
+        line |= {"cpu_seconds": round(position.cpu_seconds, 1)}
+        line |= {name: round(value, 5) for name, value in values.items()}
         with self._path.open("ab") as file:
             file.write(orjson.dumps(line) + b"\n")
         self._draw(values, position)

@@ -7,8 +7,7 @@ import multiprocessing
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import timedelta
 from typing import Any, TypeVar
 
@@ -77,14 +76,17 @@ def in_processes(devices: int, device: str, body: Callable[..., Result], *argume
     ]
     for process in others:
         process.start()
+    os.environ.update(meeting, LOCAL_RANK="0")
     try:
-        with _environment({**meeting, "LOCAL_RANK": "0"}):
-            result = body(make_fabric(device, devices), *arguments)
-            distributed.destroy_process_group()
+        result = body(make_fabric(device, devices), *arguments)
+        distributed.destroy_process_group()
     except RuntimeError as error:
         if any(process.exitcode for process in others):
             raise UserError("A training process has ended; it says above why.") from error
         raise
+    finally:
+        for name in (*meeting, "LOCAL_RANK"):
+            del os.environ[name]
     for process in others:
         process.join()
     return result
@@ -101,17 +103,3 @@ def _other(
     except UserError as error:
         sys.exit(f"Training process {rank}: {error}")
     distributed.destroy_process_group()
-
-
-@contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """Set variables for a while."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            if value is not None:
-                os.environ[name] = value

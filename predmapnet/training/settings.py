@@ -162,6 +162,7 @@ MAPTRACKER_OPTIMISER = OptimiserSettings(
     warmup_start=1 / 3,
     clip_norm=35.0,
     average_decay=0.0,
+    final_fraction=0.05,
     rates=SLOW_IMAGES,
 )
 
@@ -174,32 +175,30 @@ MAPTRACKER_AUGMENTATION = AugmentationSettings(
 )
 
 
-def _clip_stage(name: str, epochs: int, per_device: int, final: float, **changes: object) -> Stage:
-    """Return a stage of the paper: clips of five frames, noisy poses, confident rows are tracks."""
-    stage = Stage(
-        name=name,
+def _paper_stages(bev: int, warmup: int, joint: int) -> tuple[Stage, ...]:
+    """Return the three stages of Sec. 4.1 with their epochs."""
+    optimiser = MAPTRACKER_OPTIMISER
+    first = Stage(
+        name="bev",
         data="clips",
-        epochs=epochs,
-        batch=MAPTRACKER_GPUS * per_device,
-        per_device=per_device,
+        epochs=bev,
+        batch=MAPTRACKER_GPUS,
+        per_device=1,
         losses=PAPER_LOSSES,
-        optimiser=replace(MAPTRACKER_OPTIMISER, final_fraction=final),
+        optimiser=optimiser,
         tracks=TrackRules(score=0.4),
         augmentation=MAPTRACKER_AUGMENTATION,
         angle_noise=0.08,
         distance_noise=0.25,
+        vectors=False,
+        images="first and last",
     )
-    return replace(stage, **changes)  # type: ignore[arg-type]
-
-
-def _paper_stages(bev: int, warmup: int, joint: int) -> tuple[Stage, ...]:
-    """Return the three stages of Sec. 4.1 with their epochs."""
-    last = _clip_stage("joint", joint, 2, 0.003)
-    return (
-        _clip_stage("bev", bev, 1, 0.05, vectors=False, images="first and last"),
-        _clip_stage("warmup", warmup, 6, 0.95, images="none", frozen=BEV_PARTS, memory_from_step=500),
-        replace(last, optimiser=replace(last.optimiser, rates={**SLOW_IMAGES, **SLOW_BEV})),
-    )
+    second = replace(first, name="warmup", epochs=warmup, batch=6 * MAPTRACKER_GPUS, per_device=6, vectors=True)
+    slow = replace(optimiser, final_fraction=0.95)
+    second = replace(second, images="none", frozen=BEV_PARTS, memory_from_step=500, optimiser=slow)
+    third = replace(first, name="joint", epochs=joint, batch=2 * MAPTRACKER_GPUS, per_device=2, vectors=True)
+    careful = replace(optimiser, final_fraction=0.003, rates={**SLOW_IMAGES, **SLOW_BEV})
+    return first, second, replace(third, images="last", optimiser=careful)
 
 
 NUSCENES_STAGES = _paper_stages(bev=18, warmup=6, joint=48)

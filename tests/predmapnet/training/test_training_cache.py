@@ -16,7 +16,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import stack_windows
 from predmapnet.presets import preset
-from predmapnet.training.data.fill_cache import expected_bytes, fill_from_source
+from predmapnet.training.data.fill_cache import expected_bytes
 from predmapnet.training.data.prepare import DataOptions, DataSet, parse_data_sets, prepare_data
 from predmapnet.training.data.scene_cache import INDEX, CachedScene
 from tests.predmapnet.datasets.conftest import write_nuscenes
