@@ -33,7 +33,7 @@ def infer(
             help="Its name (`predmapnet scenes` lists them), or the folder of a log.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write; its ending is the format (README).")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
     save_frames: Annotated[Path | None, typer.Option(help="Per-frame results to write (.parquet).")] = None,
     dataset: Dataset = None,

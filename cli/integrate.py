@@ -22,7 +22,7 @@ def integrate(
             help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR, HDMapNet and kin.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write; its ending is the format (README).")],
     poses: Annotated[
         Path | None, typer.Option(help="Poses by token (.json or .csv), for .json results.", show_default=False)
     ] = None,

@@ -68,7 +68,7 @@ def merge(
 
 
 def _files(maps: list[Path], out: Path) -> list[Path]:
-    from mapfusion.formats.by_suffix import SUFFIXES
+    from mapfusion.formats.by_suffix import SUFFIXES, map_suffix
     from predmapnet.errors import UserError
 
     paths: list[Path] = []
@@ -76,11 +76,12 @@ def _files(maps: list[Path], out: Path) -> list[Path]:
         if not path.is_dir():
             paths.append(path)
             continue
-        endings = set(SUFFIXES) - {".json"}  # summaries and other things are JSON, too
         inside = [
             file
             for file in sorted(path.rglob("*"))
-            if file.suffix.lower() in endings and not file.name.startswith(".") and file.absolute() != out.absolute()
+            if map_suffix(file) not in (None, ".json")  # summaries and other things are JSON, too
+            and not file.name.startswith(".")
+            and file.absolute() != out.absolute()
         ]
         if not inside:
             raise UserError(f"there is no map in the folder {path}; maps end in {', '.join(SUFFIXES)}")

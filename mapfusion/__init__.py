@@ -3,7 +3,8 @@
 - :class:`MapIntegrator` fuses the :class:`FrameMap` of single frames into a :class:`GlobalMap`.
 - :func:`merge_maps` and :func:`merge_files` make one map of the maps of many drives; :func:`diff_maps` says what
   changed between two.
-- :func:`write_map` and :func:`read_map` know GeoJSON, GeoPackage, FlatGeobuf and Lanelet2.
+- :func:`write_map` and :func:`read_map` know GeoJSON, GeoPackage, FlatGeobuf, Lanelet2, OpenDRIVE, nuScenes and
+  Argoverse 2.
 - :func:`visible_ground` says what ground cameras see, :func:`seen_along` what ground a drive looked at.
 """
 

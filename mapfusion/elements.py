@@ -195,6 +195,12 @@ class MapElement:
         deviation, heights = (None if values is None else values[rows] for values in (self.deviation, self.heights))
         return replace(self, points=self.points[rows], deviation=deviation, heights=heights)
 
+    def counter_clockwise(self) -> MapElement:
+        """Return a ring that turns counter-clockwise; a line as it is."""
+        x, y = (self.points - self.points[0]).T
+        turns_back = self.kind.is_ring and float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0
+        return self.with_vertices(np.arange(len(x))[::-1]) if turns_back else self
+
     def with_origins(self, origins: Origins) -> MapElement:
         """Return it with other sources and tracks."""
         named = sorted(set(origins) - {""})

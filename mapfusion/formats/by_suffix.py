@@ -13,11 +13,15 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
+from mapfusion.formats.argoverse2_archive import read_argoverse2, write_argoverse2
 from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
 from mapfusion.formats.lanelet2 import write_lanelet
 from mapfusion.formats.lanelet2_reader import read_lanelet
 from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.formats.nuscenes_expansion import read_nuscenes, write_nuscenes
+from mapfusion.formats.opendrive import write_opendrive
+from mapfusion.formats.opendrive_reader import read_opendrive
 from mapfusion.georeference import LOCAL_FRAME, Georeference, InvertibleGeoreference
 
 SUFFIXES = {
@@ -26,19 +30,44 @@ SUFFIXES = {
     ".gpkg": "GeoPackage",
     ".fgb": "FlatGeobuf",
     ".osm": "Lanelet2",
+    ".xodr": "OpenDRIVE",
+    ".nuscenes.json": "nuScenes",
+    ".argoverse2.json": "Argoverse 2",
 }
-"""Endings of the files that hold maps, and the format of each."""
+"""Endings of the files that hold maps, and the format of each; where several fit, the longest counts."""
 
-_WRITERS = {"GeoPackage": write_geodatabase, "FlatGeobuf": write_geodatabase, "Lanelet2": write_lanelet}
-_READERS = {"GeoPackage": read_geodatabase, "FlatGeobuf": read_geodatabase, "Lanelet2": read_lanelet}
+_WRITERS = {
+    "GeoJSON": write_geojson,
+    "GeoPackage": write_geodatabase,
+    "FlatGeobuf": write_geodatabase,
+    "Lanelet2": write_lanelet,
+    "OpenDRIVE": write_opendrive,
+    "nuScenes": write_nuscenes,
+    "Argoverse 2": write_argoverse2,
+}
+_READERS = {
+    "GeoJSON": read_geojson,
+    "GeoPackage": read_geodatabase,
+    "FlatGeobuf": read_geodatabase,
+    "Lanelet2": read_lanelet,
+    "OpenDRIVE": read_opendrive,
+    "nuScenes": read_nuscenes,
+    "Argoverse 2": read_argoverse2,
+}
+
+
+def map_suffix(path: Path) -> str | None:
+    """Return the ending of a name that stands for a map format, in lower case; None if it has none."""
+    return max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len, default=None)
 
 
 def check_suffix(path: Path) -> str:
     """Return the format that the ending of a name stands for; raises ValueError for other endings."""
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = map_suffix(path)
+    if suffix is None:
         endings = ", ".join(f"{suffix} ({name})" for suffix, name in SUFFIXES.items())
         raise ValueError(f"{path}: the ending '{path.suffix}' stands for no map format; use one of {endings}")
-    return SUFFIXES[path.suffix.lower()]
+    return SUFFIXES[suffix]
 
 
 def write_map(
@@ -46,7 +75,7 @@ def write_map(
 ) -> None:
     """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
 
-    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.01 mm, deviations to
+    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.1 mm, deviations to
     1 mm and confidences to 0.0001. Rings turn counter-clockwise. :func:`read_map` gives it back.
 
     Args:
@@ -59,7 +88,7 @@ def write_map(
         ValueError: an ending that stands for no format, or coordinates not on the globe.
         OSError: the file cannot be written.
     """
-    _WRITERS.get(check_suffix(path), write_geojson)(global_map, path, georeference, provenance)
+    _WRITERS[check_suffix(path)](global_map, path, georeference, provenance)
 
 
 class MapWriter:
@@ -116,7 +145,7 @@ def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> 
         ValueError: an ending that stands for no format, or a file that is not as it should be.
         OSError: the file cannot be read.
     """
-    return _READERS.get(check_suffix(path), read_geojson)(path, georeference)
+    return _READERS[check_suffix(path)](path, georeference)
 
 
 def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
@@ -167,13 +196,13 @@ def read_box(path: Path) -> Float | None:
     match check_suffix(path):
         case "GeoPackage" | "FlatGeobuf":
             box = geodatabase_box(path)
-        case "Lanelet2":
-            box = _box_of_points(path)
-        case _:
+        case "GeoJSON":
             with path.open(encoding="utf-8-sig", errors="replace") as file:
                 head = file.read(512)
             found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
             box = json.loads(found[1]) if found else _box_of_points(path)
+        case _:
+            box = _box_of_points(path)
     if box is None:
         return None
     if len(box) == 6:  # with heights

@@ -21,7 +21,7 @@ import shapely.geometry
 
 from mapfusion.elements import GlobalMap
 from mapfusion.formats.features import HEIGHTS, Feature, map_of
-from mapfusion.formats.foreign_values import number_of
+from mapfusion.formats.foreign_values import json_of, number_of
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.identities import all_named
 from mapfusion.formats.reading_notes import ReadingNotes
@@ -185,11 +185,7 @@ def _read_layer(plain: Path, path: Path, layer: str) -> tuple[list[tuple[float, 
         }
         number = number_of(numbers[place])
         rows.append((np.inf if number is None else number, Feature(content, to_degrees)))
-    try:
-        told = json.loads((info.get("layer_metadata") or {}).get(METADATA, "null"))
-    except ValueError:
-        told = None
-    return rows, told
+    return rows, json_of((info.get("layer_metadata") or {}).get(METADATA))
 
 
 _WGS84 = ToDegrees("EPSG:4326", "")

@@ -16,7 +16,7 @@ class Outputs:
     """Paths of the outputs; None for those that are not written.
 
     Attributes:
-        map: GeoJSON, GeoPackage, FlatGeobuf or Lanelet2, by its ending.
+        map: of the format that its ending stands for (:data:`mapfusion.formats.by_suffix.SUFFIXES`).
         recording: Rerun recording.
         frames: per-frame results (Parquet).
         force: replace a map that was changed since we wrote it.
