@@ -191,7 +191,7 @@ class _Merge:
         check_frames((entry.name, entry.frame) for entry in entries)
         self.empty = sorted(set(names) - {entry.name for entry in entries})
         self.names = list(names)
-        self.statuses: list[MapStatus] = [MapStatus(name, 0.0, 0.0, 0, "the map is empty") for name in self.empty]
+        self.statuses: list[MapStatus] = [MapStatus(name, Correction(), 0, "the map is empty") for name in self.empty]
         self.counts = {kind.label: 0 for kind in ElementKind}
         self.metres = {kind.label: 0.0 for kind in ElementKind}
         self.tile_count = 0
@@ -250,8 +250,7 @@ class _Merge:
                 apart.add(entry.place)
             if partners:
                 self.cache.corrections[entry.place] = correction
-            shift, turn = float(np.linalg.norm(correction.shift)), float(np.degrees(correction.turn))
-            self.statuses.append(MapStatus(entry.name, shift, turn, partners, note, contradicts))
+            self.statuses.append(MapStatus(entry.name, correction, partners, note, contradicts))
         return apart
 
     def _fused(self, entries: list[_MapSummary], jobs: int, say: Progress) -> Iterator[MapElement]:

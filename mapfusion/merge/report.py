@@ -6,6 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from mapfusion.merge.corrections import Correction
+
 
 @dataclass(frozen=True)
 class MapStatus:
@@ -13,19 +17,22 @@ class MapStatus:
 
     Attributes:
         name: of the map.
-        shift: how far it was moved, metres.
-        turn: and turned, degrees.
+        correction: how its poses were corrected.
         partners: how many others it was aligned with.
         note: why it was not aligned, empty if it was.
         apart: True for a map that contradicts the others: its elements are in the result as they are, not fused.
     """
 
     name: str
-    shift: float
-    turn: float
+    correction: Correction
     partners: int
     note: str = ""
     apart: bool = False
+
+    @property
+    def shift(self) -> float:
+        """How far it was moved, metres."""
+        return float(np.linalg.norm(self.correction.shift))
 
 
 @dataclass(frozen=True)

@@ -79,9 +79,10 @@ def far_from(elements, truth, distance) -> float:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_alignment_finds_the_offset_between_noisy_maps(seed):
+    """Two drives with poses off by 0.75 m, 1.5 m and 0.85 degrees (RTMap's) are seldom farther apart."""
     rng = np.random.default_rng(seed)
     truth = town(seed)
-    offset, turn = rng.uniform(-2.5, 2.5, 2), np.radians(rng.uniform(-0.8, 0.8))
+    offset, turn = rng.uniform(-4.5, 4.5, 2), np.radians(rng.uniform(-3.2, 3.2))
     one = landmarks(drive_map(truth, rng))
     two = landmarks(drive_map(truth, rng, offset=offset, turn=turn))
     found = align(two, one)
