@@ -19,10 +19,10 @@ from cli.options import (
     Origin,
     PrecisionOption,
     Rate,
-    Threads,
+    SceneThreads,
     Weights,
 )
-from predmapnet.machine import EngineKind, NetworkOptions, Precision, use_threads
+from predmapnet.machine import THREADS_PER_SCENE, EngineKind, NetworkOptions, Precision, use_threads
 
 
 def infer(
@@ -45,7 +45,7 @@ def infer(
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
     engine: Engine = EngineKind.TORCH,
-    threads: Threads = 0,
+    threads: SceneThreads = THREADS_PER_SCENE,
     allow_missing_cameras: AllowMissingCameras = False,
     force: Force = False,
     as_json: Json = False,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.options import Force, Json
+from cli.workers import Address, EngineOption, Jobs, WorkerKind, open_executor
 
 if TYPE_CHECKING:
     from mapfusion.merge.report import MergeReport
@@ -23,7 +24,9 @@ def merge(
     tile: Annotated[
         float, typer.Option(min=50.0, help="Side of a tile, metres; larger tiles need more memory.")
     ] = 200.0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
+    jobs: Jobs = None,
+    engine: EngineOption = WorkerKind.PROCESS,
+    address: Address = None,
     style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
     force: Force = False,
     as_json: Json = False,
@@ -46,8 +49,13 @@ def merge(
         check_suffix(out)
     paths = _files(maps, out)
     check_output(out, (), paths, force)
-    with value_errors_told(), progress_display() as display:
-        report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
+    config, told = MergeConfig(tile=tile), {"version": __version__}
+    with (
+        value_errors_told(),
+        progress_display() as display,
+        open_executor(engine, address, jobs, apart=False) as (executor, _),
+    ):
+        report = merge_files([path.absolute() for path in paths], out, config, executor, display.preparing, told)
     written = [out, *(write_styles(out) if style else ())]
     if as_json:
         print_json({**asdict(report), "written": written})

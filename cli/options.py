@@ -68,6 +68,14 @@ Compile = Annotated[
     ),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
+SceneThreads = Annotated[
+    int,
+    typer.Option(
+        "--threads",
+        min=1,
+        help="CPU threads of a scene. The last digits of a map depend on them, but not on anything else.",
+    ),
+]
 Origin = Annotated[
     str | None,
     typer.Option(

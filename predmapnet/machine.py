@@ -5,13 +5,19 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
-import signal
 import sys
 import threading
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+
+THREADS_PER_SCENE = 1
+"""CPU threads with which a scene is mapped unless a user says otherwise, alone or beside others: the order of sums, and
+with it the last digits of a map, depends on them."""
+
+
+WORKER_MEMORY = 2 * 2**30
+"""Memory that a worker of a batch may need, bytes."""
 
 
 class Precision(StrEnum):
@@ -90,21 +96,12 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def begin_worker(threads: int) -> None:
-    """Prepare a worker process: CPU threads, an end with its parent, and Ctrl-C left to the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    use_threads(threads)
-
-
-def stop_workers(pool: ProcessPoolExecutor) -> None:
-    """End all processes of a pool at once, whatever they are doing."""
-    workers = list((getattr(pool, "_processes", None) or {}).values())
-    for worker in workers:
-        worker.kill()
-    for worker in workers:
-        worker.join()
-    pool.shutdown(wait=False, cancel_futures=True)
+def workers_that_fit(device: str) -> int:
+    """Number of workers of a batch: one on a GPU; else one a core, one core left free, as many as the memory holds."""
+    if device != "cpu" and Path("/proc/driver/nvidia/gpus").is_dir():
+        return 1
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return max(1, min(available_cores() - 1, memory // WORKER_MEMORY))
 
 
 def end_with_parent() -> None:

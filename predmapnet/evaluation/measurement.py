@@ -52,6 +52,7 @@ class SceneMeasurement:
         mapping_seconds: wall time of mapping; None where results were read.
         absent_frames: frames that the results lack, measured as empty ones.
         weights_sha256: of the weights that made the maps; None where unknown.
+        maps: the map of the drive and the true one, for drawings; None where one is missing.
     """
 
     frames: tuple[EvaluationFrame, ...]
@@ -74,6 +75,7 @@ class SceneMeasurement:
     mapping_seconds: float | None = None
     absent_frames: int = 0
     weights_sha256: str | None = None
+    maps: tuple[GlobalMap, GlobalMap] | None = None
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def test_after_sigkill_the_rest_is_mapped_and_the_maps_are_the_same(predmapnet, 
     reference = tmp_path / "reference"
     reference.mkdir()
     for scene in SCENES:
-        command = ("infer", scene, "--out", reference / f"{scene}.geojson", "--threads", 1)
+        command = ("infer", scene, "--out", reference / f"{scene}.geojson")
         assert predmapnet(*command, *settings(data, random_weights)).code == 0
 
     out = tmp_path / "maps"
@@ -79,10 +79,13 @@ def test_a_failed_scene_is_listed_with_its_reason_and_tried_again(predmapnet, da
     arguments = ["batch", "scene-0001", "scene-0002", "--out", "maps", *settings(data, random_weights)]
     first = predmapnet(*arguments)
     assert first.code == 1
-    assert "scene-0002" in first.err
+    assert "scene-0002  FAILED" in first.err
     assert "cut short" in first.err
     assert "1 of 2 scenes are done" in first.out
     out = tmp_path / "maps"
+    failure = json.loads((out / "scene-0002.failed.json").read_text())
+    assert failure["error"] == "UserError"
+    assert "cut short" in failure["reason"]
     assert sorted(path.name for path in out.glob("*.geojson")) == ["scene-0001.geojson"]
     assert {line["scene"]: line["status"] for line in log_lines(out)} == {"scene-0001": "done", "scene-0002": "failed"}
 
@@ -90,6 +93,32 @@ def test_a_failed_scene_is_listed_with_its_reason_and_tried_again(predmapnet, da
     second = predmapnet(*arguments)
     assert second.code == 0
     assert [line["status"] for line in log_lines(out)][2:] == ["done before", "done"]
+    assert not (out / "scene-0002.failed.json").exists()
+
+
+def test_a_manifest_names_scenes_of_several_folders_and_the_summary_keeps_all_of_them(
+    predmapnet, data, random_weights, tmp_path
+):
+    write_tiny_nuscenes(tmp_path / "other", ("scene-0007",), frames=2)
+    (tmp_path / "list.csv").write_text("scene,folder\nscene-0001,data\nscene-0007,other\nscene-0009,other\n")
+    result = predmapnet("batch", "list.csv", "--out", "maps", "--weights", random_weights)
+    assert result.code == 1
+    assert "scene-0009" in result.err
+    again = predmapnet("batch", "scene-*2", "--out", "maps", *settings(data, random_weights))
+    assert again.code == 0, again.err
+    assert sorted(path.stem for path in (tmp_path / "maps").glob("*.geojson")) == [
+        "scene-0001",
+        "scene-0002",
+        "scene-0007",
+    ]
+    summary = json.loads((tmp_path / "maps" / "summary.json").read_text())
+    assert summary["counts"] == {"done before": 2, "done": 1, "failed": 1}
+    assert {scene["scene"]: scene["status"] for scene in summary["scenes"]} == {
+        "scene-0001": "done before",
+        "scene-0002": "done",
+        "scene-0007": "done before",
+        "scene-0009": "failed",
+    }
 
 
 def test_wrong_scenes_and_folders_are_told_before_the_work(predmapnet, data, random_weights, tmp_path):
