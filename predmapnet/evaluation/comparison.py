@@ -121,11 +121,7 @@ class Comparison:
 
 
 def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
-    """Compare evaluations.
-
-    Args:
-        paths: files of ``predmapnet evaluate --json``, at least two; the first is the one to compare with.
-        seed: of the draws.
+    """Compare evaluations, files of ``predmapnet evaluate --json``, with the first of them; ``seed`` is of the draws.
 
     Raises:
         UserError: a file is missing, is no evaluation or has no figures of single scenes, or the evaluations are of

@@ -48,11 +48,7 @@ class ForecastErrors:
 
 
 def forecast_errors(frames: Sequence[EvaluationFrame]) -> ForecastErrors:
-    """Measure all forecasts of one scene; the first frame has no past ego motion and is left out.
-
-    Args:
-        frames: all frames of the scene in order.
-    """
+    """Measure all forecasts of one scene; its first frame has no past ego motion and is left out."""
     collected: tuple[list[list[float]], ...] = tuple([] for _ in HORIZONS)
     targets = [_targets(frame) for frame in frames]
     for now in range(1, len(frames)):
@@ -88,11 +84,9 @@ def pool_forecasts(parts: Sequence[ForecastErrors]) -> ForecastErrors:
 
 
 def pointwise_error(points: Float, target: Float, ring: bool) -> float:
-    """Mean distance of corresponding points, metres, for the best direction (and start, if it is a ring).
+    """Mean distance of corresponding points ``(n, 2)``, metres, for the best direction (and start, if it is a ring).
 
-    Args:
-        points, target: ``(n, 2)``, the same number of points at equal distances.
-        ring: closed, the first point repeated at the end.
+    Both have equally many points at equal distances; a ring repeats the first one at the end.
     """
     orders = np.stack([target, target[::-1]])
     if ring:

@@ -27,11 +27,7 @@ _OVERLAP = {
 
 
 def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
-    """Recognise the region for which elements were made.
-
-    Args:
-        path: of the results, for messages.
-        polylines: all elements of all frames, ``(k, 2)`` each, metres, ego frame.
+    """Recognise the region for which elements (``(k, 2)`` each, metres, ego frame) were made.
 
     Raises:
         UserError: the axes are not x forward and y left, or the elements fit neither region of the benchmarks.
@@ -80,14 +76,7 @@ def frames_look_like(names: Iterable[str]) -> str | None:
 
 
 def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, int]:
-    """Recognise the split of scenes.
-
-    Args:
-        infos: all scenes of the data set.
-        scenes: names of those that are measured.
-
-    Returns:
-        The split, and the number of its scenes.
+    """Recognise the split of the scenes that are measured; returns it, and how many scenes the data set has of it.
 
     Raises:
         UserError: the scenes belong to several splits.
@@ -107,12 +96,8 @@ def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, in
 def warnings_of(dataset: str, scheme: str, split: str, measured: int, in_split: int) -> list[str]:
     """Return what a reader of the figures must know of the scenes.
 
-    Args:
-        dataset: ``nuscenes``, ``argoverse2`` or ``demo``.
-        scheme: ``old`` or ``new``.
-        split: of the scenes.
-        measured: number of scenes.
-        in_split: number of scenes that the split has here.
+    Of ``dataset`` (``nuscenes``, ``argoverse2`` or ``demo``), by the ``old`` or ``new`` scheme of splits, ``measured``
+    scenes are, of as many as its split has here.
     """
     found = []
     if split == "train":

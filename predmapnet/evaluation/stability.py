@@ -98,13 +98,9 @@ def scene_instances(
     protocol: Protocol = Protocol.ANCHORED,
     interval: int = INTERVAL,
 ) -> SceneInstances:
-    """Find the instances of one scene, the costly part.
+    """Find the instances of one scene, the costly part, in all of its frames in order.
 
-    Args:
-        frames: all frames of the scene in order.
-        truth_ids: per frame ``(g,)`` ids of the true elements, unique per kind; paired instances ignore them.
-        protocol: see :class:`Protocol`.
-        interval: frames from the previous to the current one.
+    ``truth_ids`` are per frame ``(g,)`` ids of the true elements, unique per kind; paired instances ignore them.
     """
     if protocol is Protocol.PAIRED:
         return paired_instances(frames, interval)
@@ -117,10 +113,10 @@ def stability(
     interval: int = INTERVAL,
     weight: float = LOCALISATION_WEIGHT,
 ) -> Stability:
-    """Compute the values of all instances.
+    """Compute the values of all instances: frames of each scene, in the data set's order, and what was found there.
 
     Args:
-        scenes: frames of each scene and their :func:`scene_instances`, in the order of the data set.
+        scenes: frames and their :func:`scene_instances`.
         protocol, interval: with which the instances were found.
         weight: of the localisation; the shape has the rest.
     """
