@@ -90,12 +90,7 @@ def input_size(config: ImageConfig) -> tuple[int, int]:
 
 
 def crop_image(image: Image, camera: Camera, config: ImageConfig) -> WindowPixels:
-    """Scale one stored image and cut out what the network sees.
-
-    Args:
-        image: ``(camera.height, camera.width, 3) uint8``, RGB.
-        camera: the camera that took it.
-        config: the network's image input.
+    """Scale one stored image ``(camera.height, camera.width, 3) uint8``, RGB, and cut out what the network sees.
 
     Returns:
         ``(config.height, config.width, 3)``, RGB; rows that the image does not have are black.
@@ -128,11 +123,7 @@ def _scaled_rows(image: Image, window: ImageWindow, first: int, last: int) -> ND
 
 
 def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
-    """Turn windows into the network's input.
-
-    Args:
-        images: ``(..., h, w, 3)`` RGB, 0 to 255, from :func:`crop_image`.
-        config: the network's image input.
+    """Turn windows of :func:`crop_image`, ``(..., h, w, 3)``, into the network's input.
 
     Returns:
         ``(..., 3, rows, columns) float32`` of :func:`input_size`, channels-last in memory. Red, green, blue for a

@@ -20,7 +20,7 @@ class MaskHead(nn.Module):
         super().__init__()
         fine, middle, _ = config.bev.widths
         width = config.decoder.width
-        self.stride = config.masks.stride
+        self.stride = config.bev.mask_stride
         self.features = Pointwise(middle if self.stride == 2 else fine, config.masks.channels)
         self.norm = nn.LayerNorm(width)
         self.embedding = Perceptron(width, width, config.masks.channels)
@@ -37,7 +37,7 @@ class MaskHead(nn.Module):
 
 
 def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float) -> Tensor:
-    """Turn masks into the cells that each query may attend to (eq. 1).
+    """Turn masks into the cells ``(B, R, rows * columns) bool`` that each query may attend to (eq. 1).
 
     A coarse cell is in the mask if any of the cells below it is, since map lines are one cell wide. A query whose mask
     is empty attends everywhere, as in Mask2Former.
@@ -46,9 +46,6 @@ def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float
         mask_logits: ``(B, R, H_m, W_m)``.
         size: rows and columns of the level that is attended to.
         threshold: tau_L, a probability.
-
-    Returns:
-        ``(B, R, rows * columns) bool``.
     """
     if mask_logits.shape[-2:] != size:
         mask_logits = largest_in_cells(mask_logits, size)

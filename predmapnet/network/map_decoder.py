@@ -46,11 +46,7 @@ class MapDecoder(nn.Module):
     learns_start: bool
 
     def forward(self, start: DecoderInput, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode.
-
-        Args:
-            start: rows to begin with.
-            bev: ``(B, C_0, H, W)``.
+        """Decode rows over the finest BEV level ``(B, C_0, H, W)``.
 
         Returns:
             Embeddings ``(B, T + Q, C)`` of the last layer, and of every layer the logits ``(B, T + Q, classes)`` and

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from predmapnet.config import EncoderBevMemoryConfig
+from predmapnet.config import BevFormerConfig
 from predmapnet.errors import UserError
 from predmapnet.network.ego_motion import relative_motion, relative_pose
 from predmapnet.network.maptracker.bev_memory import store_bev_map
@@ -95,9 +95,8 @@ def clip_losses(
     Raises:
         UserError: the network is of another kind.
     """
-    if not isinstance(network.config.temporal_bev, EncoderBevMemoryConfig) or not isinstance(
-        network.propagation, PoseTrackPropagation
-    ):
+    encoder = network.config.bev
+    if not isinstance(encoder, BevFormerConfig) or not isinstance(network.propagation, PoseTrackPropagation):
         raise UserError(f"{network.config.name} does not train in clips: it has not MapTracker's decoder and memory.")
     past = _no_past(network, len(clip[0].inputs.images))
     terms: dict[str, Tensor] = {}
@@ -109,7 +108,7 @@ def clip_losses(
         bev = network.encode_bev(images, frame.inputs, seen)
         if not stage.vectors:
             _add(terms, _segmentation_terms(network.segmentation_head(bev.levels[0]), frame.targets))
-            maps = store_bev_map(past.state, bev.levels[0], frame.inputs.ego_to_global, network.config.temporal_bev)
+            maps = store_bev_map(past.state, bev.levels[0], frame.inputs.ego_to_global, encoder.memory)
             past.state = _with_maps(past.state, maps, frame.inputs.ego_to_global)
             continue
         outputs = network.decode_bev(bev, frame.inputs, seen)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from predmapnet.config import PredMapNetConfig, ResNet50Config
+from predmapnet.config import BevFormerConfig, PredMapNetConfig
 from predmapnet.network.calibration import collate_calibrations, pad_cameras
 from predmapnet.network.image_input import input_size
 from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
@@ -76,7 +76,7 @@ class ImageClips:
         stored, config = self._scenes.scenes[scene], self._config
         assert stored.lidar is not None, "the cache of a network that learns depth holds lidar"
         rig: Rig = tuple(window_camera(camera, config) for camera in stored.rig)
-        stride = LEVEL_STRIDES[0] if isinstance(config.backbone, ResNet50Config) else STRIDE
+        stride = LEVEL_STRIDES[0] if isinstance(config.bev, BevFormerConfig) else STRIDE
         targets = depth_targets(stored.lidar[frame].astype(np.float64), rig, stride, config.depth)
         missing = [
             -(-size // stride) - cells for size, cells in zip(input_size(config.image), targets.shape[1:], strict=True)

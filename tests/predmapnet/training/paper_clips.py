@@ -8,8 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from mapfusion.elements import ElementKind
 from predmapnet.config import PredMapNetConfig
@@ -20,7 +19,7 @@ from predmapnet.scenes import FrameTruth
 from predmapnet.training.clip_losses import ClipFrame, clip_losses
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import CLIP_STAGES, ClipSettings, ClipStage
-from tests.predmapnet.network.small_baseline import frames, small_config
+from tests.predmapnet.small_networks import PlainBackbone, frames, small_config
 
 BEV, WARMUP, JOINT = CLIP_STAGES
 CALM = ClipSettings(angle_noise=0.0, distance_noise=0.0)
@@ -43,18 +42,6 @@ class Watched(PredMapNet):
         return self.states[-1]
 
 
-class PlainBackbone(nn.Module):
-    """One convolution in place of a ResNet-50, at the same strides."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.convolution = nn.Conv2d(3, channels, 8, stride=8)
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        fine = torch.relu(self.convolution(images / 30.0))
-        return [fine, functional.avg_pool2d(fine, 2), functional.avg_pool2d(fine, 4, ceil_mode=True)]
-
-
 def clip_network(**sections: dict[str, object]) -> Watched:
     """Return a network in training mode whose zero-started branches are open."""
     calm = {"bev": {"dropout": 0.0}, "decoder": {"dropout": 0.0, "points": 20}}
@@ -67,7 +54,7 @@ def clip_network(**sections: dict[str, object]) -> Watched:
 def _built(text: str) -> Watched:
     torch.manual_seed(0)
     network = Watched(parse_config(text, "test"))
-    network.image_backbone = PlainBackbone(network.config.backbone.channels)
+    network.image_backbone = PlainBackbone(network.config.bev.width)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             if not parameter.any() or name.endswith("offsets.weight"):

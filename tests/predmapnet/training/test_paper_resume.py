@@ -12,8 +12,9 @@ from predmapnet.training.data.batches import TrainingScenes
 from predmapnet.training.loop import Trainer
 from predmapnet.training.process_group import ProcessGroup
 from predmapnet.training.settings import Budget, ClipSettings, plan_run
+from tests.predmapnet.small_networks import PlainBackbone
 from tests.predmapnet.training.painted_scenes import painted_scene
-from tests.predmapnet.training.paper_clips import JOINT, PlainBackbone
+from tests.predmapnet.training.paper_clips import JOINT
 from tests.predmapnet.training.tiny_clips import tiny_paper_config
 
 CONFIG = tiny_paper_config()
@@ -37,7 +38,7 @@ def scenes(tmp_path_factory):
 def run(folder, scenes, resume=False, cut_at=None):
     torch.manual_seed(3)
     network = PredMapNet(CONFIG)
-    network.image_backbone = PlainBackbone(CONFIG.backbone.channels)
+    network.image_backbone = PlainBackbone(CONFIG.bev.width)
     trainer = Trainer(network, SETTINGS, folder, ProcessGroup(), lambda _line: None)
     if resume:
         trainer.resume()
@@ -77,7 +78,7 @@ def test_dropout_draws_other_numbers_for_another_seed(tmp_path, scenes):
     for seed in (3, 4):
         torch.manual_seed(0)
         network = PredMapNet(CONFIG)
-        network.image_backbone = PlainBackbone(CONFIG.backbone.channels)
+        network.image_backbone = PlainBackbone(CONFIG.bev.width)
         training = ClipTraining(JOINT, network, scenes, SETTINGS, ProcessGroup())
         batch = training.make_batch(0)
         torch.manual_seed(seed)
