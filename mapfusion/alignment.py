@@ -126,14 +126,10 @@ def landmarks(global_map: GlobalMap, config: AlignmentConfig | None = None) -> L
 
 
 def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None = None) -> Alignment:
-    """Find the rigid motion that puts ``source`` on ``target``, and whether to believe it.
+    """Find the rigid motion that puts ``source`` on ``target`` (both of :func:`landmarks`), and whether to believe it.
 
     Pairs of samples of one kind vote for the shift between them (from several turns, if need be); the best shift is
     refined by Gauss-Newton on distances across lines, the worst fifth left out.
-
-    Args:
-        source, target: from :func:`landmarks`.
-        config: what it takes to be certain.
     """
     config = config or AlignmentConfig()
     everything = np.arange(len(source.samples))

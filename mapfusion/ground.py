@@ -91,10 +91,8 @@ def visible_ground(
     Example:
         >>> truck = np.array([[5.0, 2.0], [13.0, 2.0], [13.0, 4.5], [5.0, 4.5]])
         >>> rings = visible_ground(RegionOfInterest(), [CameraSector(np.zeros(2))], [truck])
-        >>> bool(shapely.contains_xy(ground_within(rings), 15.0, 8.0)), bool(
-        ...     shapely.contains_xy(ground_within(rings), 15.0, -8.0)
-        ... )
-        (False, True)
+        >>> shapely.contains_xy(ground_within(rings), [15.0, 15.0], [8.0, -8.0]).tolist()
+        [False, True]
     """
     reach = 2.0 * float(np.hypot(*roi.size))
     seen = []
@@ -154,12 +152,9 @@ def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None)
     """Return the ground that a map speaks of, metres, in the map's frame.
 
     A map that says so itself is believed: ``provenance["observed"]`` holds rings of longitude and latitude, as
-    ``predmapnet infer`` writes them from the drive. Otherwise it is the ground near its elements: the car passed where
-    it found something, and a detector that found the kerb would have found the crossing beside it.
-
-    Args:
-        global_map: the map.
-        plane: leads from degrees to the map's frame; without it the second way is taken.
+    ``predmapnet infer`` writes them from the drive. Otherwise, or without a ``plane`` that leads from degrees to the
+    map's frame, it is the ground near its elements: the car passed where it found something, and a detector that
+    found the kerb would have found the crossing beside it.
     """
     observed = global_map.provenance.get("observed")
     if observed and plane is not None:

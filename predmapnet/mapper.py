@@ -135,21 +135,17 @@ class Mapper:
         images: CameraImages | None = None,
         allow_missing_cameras: bool = False,
     ) -> tuple[FrameMap, StreamState]:
-        """Map one frame.
+        """Map the next frame of a log.
 
         Args:
             frame: the next of its log.
             state: returned by the step before; None begins a log.
             images: of this frame, if :meth:`read_images` was called ahead; read here otherwise.
-            allow_missing_cameras: as in :meth:`read_images`.
+            allow_missing_cameras: as in :meth:`read_images`, which also says what errors there are.
 
         Returns:
             The map of this instant, ``visible`` saying what ground the cameras with an image cover, and the state for
             the next step. ``state`` itself is not changed.
-
-        Raises:
-            UserError: an image is missing, damaged, or not of its camera's size, or the car has other cameras than the
-                network has learned.
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
@@ -205,13 +201,7 @@ def to_frame_map(
 ) -> FrameMap:
     """Return the frame map of one stream: tracks first, then detections without a track.
 
-    Args:
-        selection: result of :func:`predmapnet.network.track_selection.select`.
-        state: after the frame.
-        segmentation: ``(1, 3, H_s, W_s)`` logits.
-        config: of the network.
-        timestamp: nanoseconds.
-        ego_to_global: ``(4, 4) float64``.
+    The state is that after the frame; ``segmentation`` is ``(1, 3, H_s, W_s)`` logits.
     """
     tracks, others = _rows(selection.instances), _rows(selection.detections)
     kinds = np.concatenate([tracks["labels"], others["labels"]])

@@ -65,15 +65,7 @@ class LocalStations:
 
 
 def stations_near(lines: Mapping[int, FusedLine], low: Float, high: Float) -> LocalStations | None:
-    """Collect the stations inside a box of the global frame, as coordinates from ``low``.
-
-    Args:
-        lines: elements by id.
-        low, high: ``(2,)``, metres.
-
-    Returns:
-        The stations, or None where there are none.
-    """
+    """Collect the stations inside a box of the global frame, as coordinates from ``low``; None where there are none."""
     if not lines:
         return None
     curves = [line.curve.points for line in lines.values()]
@@ -137,11 +129,7 @@ def line_candidates(
 def best_assignment(benefits: Sequence[Mapping[int, float]]) -> list[int | None]:
     """Give each observation at most one element and each element at most one observation, best in total.
 
-    Args:
-        benefits: per observation, the benefit (> 0) of each element it may belong to.
-
-    Returns:
-        The element of each observation, or None.
+    ``benefits`` hold for each observation the benefit (> 0) of each element it may belong to.
     """
     columns = sorted({element for row in benefits for element in row})
     table = np.zeros((len(benefits), len(columns)))
@@ -242,15 +230,7 @@ def ring_candidates(
     visible: shapely.Geometry | None,
     config: IntegratorConfig,
 ) -> list[RingCandidates]:
-    """Compare the rings of a frame with the crossings of the map near it.
-
-    Args:
-        observations: rings of the frame.
-        rings: crossings near it, by id.
-        frame_map: the frame.
-        visible: ground that could be seen, ego frame; None for all of the ROI.
-        config: of the integrator.
-    """
+    """Compare the rings of a frame with the crossings of the map near it, by id."""
     corners = np.array([ring.corner for ring in rings.values()], dtype=np.int64).reshape(-1, 2)
     stops = np.array([ring.stop for ring in rings.values()], dtype=np.int64).reshape(-1, 2)
     ids = list(rings)

@@ -87,12 +87,9 @@ def ring_elements(
 
 
 def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
-    """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information).
+    """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information): ``(n, 2)``.
 
     Minimises ``sum information |z - p|² + sum |second difference of z|² / curvature_deviation²``.
-
-    Returns:
-        ``(n, 2) float64``.
     """
     count = len(curve)
     if count < 3:

@@ -105,11 +105,8 @@ def _average(base: StationCurve, new: StationCurve, match: Correspondence, verte
 def _extension(part: StationCurve, foot: Float, shift: Float, base: Float) -> StationCurve:
     """Return a part led over from the base's end, up to where it comes back to the base (a closed loop).
 
-    Args:
-        part: vertices past the end, nearest first.
-        foot: ``(2,)``, where the base's end falls on the unshifted curve.
-        shift: ``(2,)``, from there to the fused end.
-        base: ``(n, 2)`` stations of the base.
+    Its vertices past the end come nearest first; ``foot`` is where the base's end falls on the unshifted curve, and
+    ``shift`` leads from there to the fused end.
     """
     at_start = squared(base[0] - foot) < squared(base[-1] - foot)
     end = base[0] if at_start else base[-1]

@@ -138,11 +138,7 @@ def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, c
 
 
 def joined_along(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
-    """Join along links, each end once, in their order.
-
-    Returns:
-        The least number in each joined element, ascending, and the element.
-    """
+    """Join along links, each end once, in their order: the least number in each joined element, ascending, and it."""
 
     def join(before: MapElement, after: MapElement, number: int) -> MapElement:
         return _joined(before, after, links[number].overlap)

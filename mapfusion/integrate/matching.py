@@ -173,11 +173,8 @@ class _Feet(NamedTuple):
 def _feet(pairs: _Pairs, square: Float, ahead: Bool, limits: MatchLimits) -> _Feet:
     """Find the foot of each station.
 
-    Args:
-        pairs: of stations and vertices.
-        square: ``(n, m)``, rises with the distance; infinite for vertices that are no choice.
-        ahead: ``(n,)``, whether the station must run along the curve or against it.
-        limits: of a match.
+    ``square (n, m)`` rises with the distance and is infinite for vertices that are no choice; ``ahead (n,)`` says
+    whether the station must run along the curve or against it.
     """
     curve = pairs.curve
     vertex = square.argmin(axis=1)

@@ -79,8 +79,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 def notes_of_copies(maps: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
     """Return a note for each map that is an edited copy of another.
 
-    Args:
-        maps: names, and digests of what the maps say of their making, the moment included.
+    The maps are names and digests of what they say of their making, the moment included.
     """
     first: dict[str, str] = {}
     notes = []

@@ -31,14 +31,9 @@ class _Cluster:
 
 
 def fuse_rings(contributions: Sequence[Contribution], config: MergeConfig) -> list[MapElement]:
-    """Fuse the crossings of several maps of one place.
+    """Fuse the crossings of several maps of one place: those that more likely exist than not.
 
-    Args:
-        contributions: one per map, in an order that does not depend on how the maps were given.
-        config: what is assumed.
-
-    Returns:
-        The crossings of which it is more likely than not that they exist.
+    The contributions, one per map, come in an order that does not depend on how the maps were given.
     """
     clusters: list[_Cluster] = []
     for contribution in contributions:

@@ -194,9 +194,8 @@ class Argoverse2Source:
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which logs frames belong to; unknown tokens are absent.
 
-        Args:
-            tokens: ``<log>_<timestamp>`` as MapTRv2 and this package name frames, or the time stamp alone as
-                StreamMapNet and MapTracker do.
+        Tokens are ``<log>_<timestamp>`` as MapTRv2 and this package name frames, or the time stamp alone as
+        StreamMapNet and MapTracker do.
         """
         known: dict[str, str] = {}
         for info in self.scenes():
@@ -217,12 +216,7 @@ class Argoverse2Scene:
     georeference: Georeference | None
 
     def __init__(self, folder: Path, info: SceneInfo, timestamps: Integer) -> None:
-        """Read the poses; calibration, images and the map are read when they are asked for.
-
-        Args:
-            folder: of the log.
-            info: the log's line in the listing.
-            timestamps: ``(n,)`` of the sweeps that are frames, nanoseconds.
+        """Read the poses at time stamps ``(n,)``, nanoseconds; all else is read when it is asked for.
 
         Raises:
             UserError: poses are missing or damaged.

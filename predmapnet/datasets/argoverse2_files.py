@@ -87,12 +87,7 @@ def rows_by_sensor(path: Path, columns: tuple[str, ...]) -> dict[str, dict[str, 
 
 
 def read_table(path: Path, columns: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
-    """Read a feather file: its columns by name.
-
-    Args:
-        path: the file.
-        columns: those that it must have, of numbers.
-        texts: those that it must have besides.
+    """Read a feather file, by name the ``columns`` of numbers and the ``texts`` that it must have.
 
     Raises:
         UserError: the file is missing or damaged, lacks a column, or a column holds something else.

@@ -158,25 +158,18 @@ def argoverse2_georeference(city: str) -> UtmGeoreference | None:
 
 
 def demo_georeference(name: str, index: int) -> SphereGeoreference:
-    """Return a place in the South Pacific for a demo town; towns lie on a grid of 0.1 degrees and never overlap.
+    """Return a place in the South Pacific for a demo town of that seed.
 
-    Args:
-        name: of the town.
-        index: seed of the town, from 0; towns may be 10 km across.
+    Towns lie on a grid of 0.1 degrees and never overlap; they may be 10 km across.
     """
     row, column = divmod(index, 20)
     return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)
 
 
 def georeference_of(location: str, synthetic: bool = False) -> SphereGeoreference | UtmGeoreference | None:
-    """Return where the frame of a location lies: a nuScenes map, an Argoverse 2 city or a town of the demo world.
+    """Return where a frame lies (``boston-seaport``, ``PIT``, ``town-0101``), or None for an unknown location.
 
-    Args:
-        location: as frames' files and maps name it: ``boston-seaport``, ``PIT``, ``town-0101``.
-        synthetic: whether the place is made up; a made-up one never lies where a real one does.
-
-    Returns:
-        The georeference, or None for an unknown location.
+    A made-up (``synthetic``) place never lies where a real one does.
     """
     town = re.fullmatch(r"town-(\d{4})", location)
     if town is not None:

@@ -15,14 +15,7 @@ NUSCENES_COLUMNS = 5
 
 
 def read_nuscenes_sweep(path: Path, lidar_to_ego: Float) -> Float:
-    """Read a ``.pcd.bin`` file.
-
-    Args:
-        path: of the sweep.
-        lidar_to_ego: ``(4, 4)``.
-
-    Returns:
-        ``(n, 3) float64``, metres, ego frame.
+    """Read a ``.pcd.bin`` file as points ``(n, 3) float64``, metres, ego frame.
 
     Raises:
         UserError: the file's length is not that of whole points.

@@ -173,15 +173,7 @@ class NuScenesScene:
         ground_truth: Callable[[], NuScenesGroundTruth | None],
         georeference: Georeference | None,
     ) -> None:
-        """Read the scene's records.
-
-        Args:
-            root: folder with ``samples``.
-            tables: of the version.
-            info: the scene's line in the listing.
-            ground_truth: reads its map, if there is one; called when it is needed.
-            georeference: of the global frame, if it is known.
-        """
+        """Read the scene's records below ``root``, the folder with ``samples``; its map is read when it is needed."""
         self.info = info
         self._read_ground_truth = ground_truth
         self.georeference = georeference

@@ -156,13 +156,9 @@ def scene_folder(name: str, cache: Path, edition: int = WORLD_VERSION) -> Path:
 
 
 def ensure_scene(name: str, cache: Path, progress: Progress | None = None, edition: int = WORLD_VERSION) -> Path:
-    """Render a scene unless that has been done.
+    """Render a scene (``scene-0103``) below a cache folder unless that has been done; ``progress`` hears of key frames.
 
-    Args:
-        name: for example ``scene-0103``.
-        cache: the folder that holds all scenes.
-        progress: called once per key frame.
-        edition: of the world; 1 has the towns of the first one, drawn as scenes are drawn today.
+    ``edition`` 1 has the towns of the first world, drawn as scenes are drawn today.
 
     Returns:
         The root of a nuScenes data set (``v1.0-mini``, ``samples``, ``maps``) with this one scene.

@@ -59,9 +59,6 @@ _WIDTHS = (640, 800, 960, 1280, 1600, 1920)
 def sample_rig(seed: int) -> Rig:
     """Draw the rig of one car: a third of the seeds get the demo car, the others a car of their own.
 
-    Args:
-        seed: the same seed gives the same rig.
-
     Returns:
         One to eight cameras, the first one looking ahead. Ego axes are those of the car; its origin lies below the
         rear axle on the road, or above it (``ground_height`` is then negative), as data sets have it.

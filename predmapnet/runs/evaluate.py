@@ -107,13 +107,9 @@ def submitted_region(results: Path, stated: RegionOfInterest | None) -> RegionOf
 def measure_scenes(
     settings: EvaluationSettings, scenes: Sequence[str], jobs: int = 1, preparing: Progress | None = None
 ) -> Iterator[SceneMeasurement]:
-    """Measure scenes one after the other or in several processes; they come in the order of ``scenes``.
+    """Measure scenes one after the other or in several processes; they come in the order of their names.
 
-    Args:
-        settings: of the evaluation.
-        scenes: names.
-        jobs: number of processes.
-        preparing: called while a scene is made ready (with one process only).
+    ``preparing`` is called while a scene is made ready (with one process only).
 
     Raises:
         UserError: data or results are broken; the message says which.

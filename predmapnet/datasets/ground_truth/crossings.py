@@ -25,16 +25,10 @@ MINIMUM_COVERED_AREA = 20.0
 
 
 def merge_crossings(polygons: Sequence[Polygon]) -> list[Polygon]:
-    """Merge pieces that belong together and drop crumbs.
+    """Merge valid pieces that belong together and drop crumbs, of less than one square metre.
 
     Both passes compare a piece with the original base, not with what the base has grown to, and neither is
     repeated; two pieces with a gap between them stay two.
-
-    Args:
-        polygons: valid, non-empty pieces.
-
-    Returns:
-        Polygons of at least one square metre.
     """
     if not polygons:
         return []

@@ -14,13 +14,7 @@ from predmapnet.errors import UserError
 
 
 def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
-    """Read a map.
-
-    Args:
-        source: JSON file, or the content of one.
-
-    Returns:
-        Its content, and the SHA-256 digest of its bytes.
+    """Read a map, from a JSON file or its content: the content, and the SHA-256 digest of its bytes.
 
     Raises:
         UserError: the file is missing, damaged, or not one JSON object.

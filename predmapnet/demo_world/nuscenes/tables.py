@@ -35,15 +35,7 @@ def sample_file_name(scene: str, channel: str, timestamp: int) -> str:
 
 
 def build_tables(world: World, rig: Rig) -> dict[str, list[Record]]:
-    """All tables by name.
-
-    Args:
-        world: the scene.
-        rig: its cameras.
-
-    Returns:
-        For each table its records, linked by tokens that depend only on the scene's name.
-    """
+    """Return the records of all tables by name, linked by tokens that depend only on the scene's name."""
     name = world.name
     channels = [camera.name for camera in rig] + [LIDAR]
     return {

@@ -272,15 +272,9 @@ def _pyramid(
 
 
 def paint_ground(world: World, light: Light, texel: float = FINE_TEXEL) -> tuple[Pyramid, Pyramid]:
-    """Paint the ground of a world.
+    """Paint the ground: the fine texture near the trajectory (``texel`` metres), the coarse one of all in sight.
 
-    Args:
-        world: map, surfaces, solids (for shadows) and trajectory.
-        light: decides shadows and how wet surfaces darken.
-        texel: side of the fine texture's cells, metres.
-
-    Returns:
-        The fine texture near the trajectory and the coarse one of everything in sight.
+    The light decides the shadows of solids and how wet surfaces darken.
     """
     poses = world.trajectory.ego_to_global
     positions = poses[:, :2, 3]

@@ -48,12 +48,7 @@ def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float
 
 
 def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EGO) -> NDArray[np.float32]:
-    """Sweep the scene once.
-
-    Args:
-        renderer: of the world.
-        frame_index: key frame.
-        lidar_to_ego: ``(4, 4)``; lidar axes as in nuScenes: x right, y forward, z up.
+    """Sweep the scene once at a key frame; lidar axes are those of nuScenes: x right, y forward, z up.
 
     Returns:
         ``(n, 5) float32``: x, y, z in metres, lidar frame; intensity in [0, 255]; ring in [0, 31]. Rays that meet

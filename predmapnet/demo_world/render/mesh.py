@@ -237,15 +237,7 @@ def _select(solids: Solids, row: int) -> _Template:
 
 
 def build_mesh(solids: Solids, rows: NDArray[np.int64]) -> Mesh:
-    """Turn solids into faces.
-
-    Args:
-        solids: all solids.
-        rows: ``(k,)``, which of them to take, at the positions they have in ``solids``.
-
-    Returns:
-        Their mesh; ``owners`` refer to rows of ``solids``.
-    """
+    """Turn rows ``(k,)`` of solids into faces; ``owners`` of the mesh refer to rows of ``solids``."""
     flat = [int(row) for row in rows if solids.shape[row] != "ellipsoid"]
     templates = [_select(solids, row) for row in flat]
     repeats = np.array([len(template.counts) for template in templates], dtype=np.int64)

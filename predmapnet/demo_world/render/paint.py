@@ -223,11 +223,9 @@ def _paint_parking(quads: Quads, bay: Polygon, generator: np.random.Generator) -
 
 
 def paint_quads(vector_map: VectorMap, seed: int) -> tuple[Float, Float]:
-    """Lay out all paint of a map.
+    """Lay out all paint of a map: dividers, markings, hatchings, crossings, stop lines and parking bays.
 
-    Args:
-        vector_map: dividers, markings, hatchings, crossings, stop lines and parking bays are painted.
-        seed: decides widths, gaps, age and wear of each element.
+    The seed decides widths, gaps, age and wear of each element.
 
     Returns:
         ``(n, 4, 2) float64`` corners, metres, and ``(n, 3) float64``: wear, albedo, yellow or white.

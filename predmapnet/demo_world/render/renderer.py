@@ -212,14 +212,9 @@ class Renderer:
         return nearness, ids
 
     def render(self, camera: Camera, frame_index: int) -> RenderedImage:
-        """Draw what ``camera`` sees at a key frame.
+        """Draw what a camera sees at a key frame; the same bytes for the same world, camera and frame.
 
-        Args:
-            camera: any pinhole camera without skew; its intrinsics hold for its width and height.
-            frame_index: index into the world's trajectory.
-
-        Returns:
-            The image and its depth; the same bytes for the same world, camera and frame.
+        Any pinhole camera without skew will do; its intrinsics hold for its width and height.
         """
         return self._draw(camera, frame_index, self._moment(frame_index))
 

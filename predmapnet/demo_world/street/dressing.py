@@ -158,17 +158,14 @@ def _put_up_furniture(
 
 
 def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, name: str) -> World:
-    """Make up everything that a vector map does not hold.
+    """Make up everything that a vector map does not hold; the same seed gives the same world.
 
     Args:
         vector_map: what is true about the road; lanes, walkways and parking bays may be missing (real maps).
         trajectory: things are put up within sight of it, and nothing stands or drives in its way.
         look: light and weather.
-        seed: the same seed gives the same world.
+        seed: of all that is drawn by chance.
         name: of the scene.
-
-    Returns:
-        A world that :class:`predmapnet.demo_world.render.renderer.Renderer` draws.
     """
     generator = np.random.default_rng([seed, 31])
     positions = trajectory.ego_to_global[:, :2, 3]

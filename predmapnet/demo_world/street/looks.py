@@ -90,12 +90,7 @@ def light_of(look: Look, seed: int) -> Light:
 
 
 def harder_light(light: Light, seed: int) -> Light:
-    """Return the light of a training scene: often haze or fog, a low sun, or a sun half behind clouds.
-
-    Args:
-        light: of :func:`light_of`.
-        seed: of the scene.
-    """
+    """Return the light of a training scene: often haze or fog, a low sun, or a sun half behind clouds."""
     generator = np.random.default_rng([seed, 103])
     kind, strength = generator.uniform(size=2)
     if kind < 0.12:

@@ -119,16 +119,10 @@ def _between_kerbs(
     limits: tuple[float, float],
     habits: Habits,
 ) -> Crossing | None:
-    """A crossing through a place on the road, from kerb to kerb.
+    """Return a crossing through a place on the paved surface, from kerb to kerb, ``depth`` metres deep.
 
-    Args:
-        random: jitters its sides.
-        surface: paved.
-        centre: ``(2,)`` metres.
-        walk: direction of walking, to the left seen from the junction, radians.
-        depth: metres.
-        limits: how far it may reach to the left and to the right of its centre, metres.
-        habits: of the town.
+    ``walk`` is the direction of walking, to the left seen from the junction, in radians; ``limits`` are how far it may
+    reach to the left and to the right of its centre.
     """
     sides = []
     for sign in (-0.5, 0.5):

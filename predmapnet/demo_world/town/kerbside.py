@@ -32,17 +32,10 @@ def build_openings(
     rate: float,
     taken: shapely.Geometry,
 ) -> list[Polygon]:
-    """Driveways, and entrances of yards with the yards, along both kerbs between two stations.
+    """Return driveways, and entrances of yards with the yards, along both kerbs between two stations of a street.
 
-    Args:
-        random: draws them.
-        line, section: of the street.
-        start, end: stations, metres.
-        rate: openings per metre of kerb.
-        taken: prepared geometry that they keep clear of (other streets).
-
-    Returns:
-        Paved pieces that overlap the street a little.
+    They are paved pieces that overlap the street a little, ``rate`` openings per metre of kerb, and keep clear of the
+    prepared geometry ``taken`` (other streets).
     """
     found: list[Polygon] = []
     for side in (1, -1):

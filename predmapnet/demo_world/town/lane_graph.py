@@ -45,7 +45,7 @@ def lanes_between(
     stop: float,
     main: bool,
 ) -> Carriageway | None:
-    """The carriageway of one direction.
+    """Return the carriageway of one direction, +1 along the stations; None where no lane goes that way.
 
     Args:
         line, section: of the street.
@@ -54,9 +54,6 @@ def lanes_between(
         nodes: at the start and the end of the stretch, along the stations.
         stop: metres before the end in driving direction.
         main: whether the street is more than an alley.
-
-    Returns:
-        None where no lane goes that way.
     """
     edges = section.edges(stations)
     lines, begins, ends = [], [], []

@@ -72,13 +72,9 @@ class ReferenceLine:
 
 
 def grow_line(start: Float, heading: float, length: float, curvature: Float) -> ReferenceLine:
-    """Grow a line from a place and a direction.
+    """Grow a line of that length from a place and a heading (radians), with curvatures ``(k,)`` per metre.
 
-    Args:
-        start: ``(2,)``, metres.
-        heading: radians.
-        length: metres.
-        curvature: ``(k,)`` values per metre at even spacing along the line, interpolated between.
+    Those lie at even spacing along the line and are interpolated between.
     """
     count = max(2, round(length / STEP) + 1)
     stations = np.linspace(0.0, length, count)

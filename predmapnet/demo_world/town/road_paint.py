@@ -45,21 +45,12 @@ def paint_street(
     stops: tuple[float, float],
     habits: Habits,
 ) -> tuple[list[Divider], list[Divider]]:
-    """Draw the lines of a street between two stations.
+    """Draw the lines of a street between two stations: dividers, and lines that are no dividers.
 
     A line between two lanes that touch is a divider, however it is painted. What only borders a painted gap, a
     median, parking or the kerb is paint and no more, as in the official truth of Argoverse 2, where a line counts
-    when both lanes beside it know each other.
-
-    Args:
-        random: decides where single lines end.
-        line, section: of the street.
-        start, end: stations, metres.
-        stops: stations at which traffic stops at the start and at the end (-inf or inf: it does not).
-        habits: of the town.
-
-    Returns:
-        Dividers, and lines that are no dividers.
+    when both lanes beside it know each other. ``stops`` are the stations at which traffic stops at the start and at the
+    end (-inf or inf: it does not).
     """
     stations = np.linspace(start, end, max(2, round((end - start) / SPACING) + 1))
     runs = _lines_between_strips(section, stations, stops, habits)

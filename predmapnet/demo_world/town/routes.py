@@ -47,14 +47,7 @@ class NoDriveError(Exception):
 
 
 def drive(town: Town, seed: int) -> Trajectory:
-    """Drive through a town for 20 s and note the pose twice a second.
-
-    Args:
-        town: where.
-        seed: the same seed gives the same drive.
-
-    Returns:
-        40 key frames, 0.5 s apart, with a small pitch and roll.
+    """Drive through a town for 20 s: 40 key frames, 0.5 s apart, with a small pitch and roll.
 
     Raises:
         NoDriveError: no street is long enough, or traffic stops the car too early.
@@ -70,13 +63,10 @@ def drive(town: Town, seed: int) -> Trajectory:
 
 
 def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
-    """Draw a walk through the town that is long enough and stays on the road, and the path of the rear axle.
+    """Draw a walk through the town that is long enough and stays on the road.
 
-    Returns:
-        The path ``(n, 2)`` at even steps, and the distances along it at which a car may have to stop.
-
-    Raises:
-        NoDriveError: the town has no such walk.
+    Returns the path ``(n, 2)`` of the rear axle at even steps, and the distances along it at which a car may have to
+    stop; raises NoDriveError if the town has no such walk.
     """
     road = town.surface.buffer(0.05)
     shapely.prepare(road)
