@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 IMAGE_SIZE = (800, 450)
 """Width and height, pixels: half of the nuScenes cameras."""

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 DEMO_SHARE = 1 / 3
 """Share of the seeds that get the demo car."""

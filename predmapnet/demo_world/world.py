@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely import Polygon
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 
 class LineStyle(StrEnum):

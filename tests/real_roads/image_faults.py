@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.scenes import Camera, Image
-
-Float = NDArray[np.float64]
 
 WIDTH = 800
 """Pixels of the width that lengths are given for."""

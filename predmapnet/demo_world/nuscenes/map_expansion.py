@@ -12,10 +12,10 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.nuscenes.tables import token
 from predmapnet.demo_world.world import Divider, LineStyle, VectorMap
 
-Float = NDArray[np.float64]
 Record = dict[str, Any]
 
 CANVAS_EDGE = (800.0, 800.0)

@@ -6,15 +6,13 @@ import hashlib
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.demo_world.world import Trajectory, World
 from predmapnet.scenes import Rig
 
-Float = NDArray[np.float64]
 Record = dict[str, Any]
 
 LIDAR = "LIDAR_TOP"

@@ -12,15 +12,13 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Byte, Float
 from predmapnet.demo_world.render.ground_kernels import compose, fill_materials, fill_paint, halve
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.paint import paint_quads, ribbon
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
 from predmapnet.demo_world.street.looks import Light
 from predmapnet.demo_world.world import World
-
-Byte = NDArray[np.uint8]
-Float = NDArray[np.float64]
 
 FINE_MARGIN = 50.0
 """Metres around the trajectory that are painted finely."""

@@ -5,20 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Byte, Float, Float32, Integer, Integer32
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import kernel, part
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.raster import Vector, View, ball_depth, face_plane, pixel_ray
 from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
 from predmapnet.demo_world.street.looks import Light
-
-Byte = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Integer = NDArray[np.int64]
-Integer32 = NDArray[np.int32]
 
 
 class Surroundings(NamedTuple):

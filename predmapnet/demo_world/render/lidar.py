@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.scenes import Camera
-
-Float = NDArray[np.float64]
 
 BEAMS = 32
 AZIMUTHS = 1080

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.world import Solids
 
-Float = NDArray[np.float64]
 Corners = list[tuple[float, float, float]]
 
 MOST_CORNERS = 8

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, Hatching, LineStyle, VectorMap
-
-Float = NDArray[np.float64]
 
 DOUBLE_GAP = 0.15
 """Metres of asphalt between the two lines of a double divider."""

@@ -11,12 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32, Integer, Integer32
 from predmapnet.demo_world.render.jit import kernel, part
 
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Integer = NDArray[np.int64]
-Integer32 = NDArray[np.int32]
 Vector = tuple[float, float, float]
 
 NEAR = 0.12

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, paint_ground
 from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
@@ -21,8 +22,6 @@ from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygo
 from predmapnet.demo_world.street.looks import Light, light_of
 from predmapnet.demo_world.world import Solids, World
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import part
 from predmapnet.demo_world.street.looks import Light
 
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Texel = tuple[float, float, float, float]
 

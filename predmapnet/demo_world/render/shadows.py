@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.world import Solids
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 LEAFY_SHADE = 64
 """Light left in the shadow of leaves, [0, 255]; flecks of sun are drawn where it is neither 0 nor 255."""

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.street.solid_list import SolidList
 from predmapnet.demo_world.street.traffic import Parking, add_moving_traffic, ego_corridor, footprint
 from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
-
-Float = NDArray[np.float64]
 
 SIGHT = 110.0
 """Metres from the trajectory within which things are put up."""

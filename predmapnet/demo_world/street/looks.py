@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float32
 from predmapnet.demo_world.world import Look
-
-Float32 = NDArray[np.float32]
 
 
 class Light(NamedTuple):

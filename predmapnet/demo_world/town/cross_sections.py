@@ -7,13 +7,11 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.street_plan import Rank
 from predmapnet.demo_world.world import LineStyle
-
-Float = NDArray[np.float64]
 
 ACTIVE = 0.6
 """A strip narrower than this is not there, metres."""

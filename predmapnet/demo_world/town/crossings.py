@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.junctions import Junction
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.town.street_plan import Rank, StreetPlan
 from predmapnet.demo_world.world import Crossing
-
-Float = NDArray[np.float64]
 
 MOST_SKEW = np.radians(30.0)
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.world import Trajectory
-
-Float = NDArray[np.float64]
 
 KEY_FRAMES = 40
 FRAME_SECONDS = 0.5

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection, Use
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.kerbside import build_lay_bys, build_openings
@@ -16,8 +16,6 @@ from predmapnet.demo_world.town.medians import median_islands
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.town.street_plan import Rank, StreetPlan
 from predmapnet.demo_world.town.works import Stretch, Works, spaced
-
-Float = NDArray[np.float64]
 
 
 def furnish(

@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection
 from predmapnet.demo_world.town.street_plan import Arm, Rank, StreetPlan
-
-Float = NDArray[np.float64]
 
 LOCAL_REACH = 65.0
 """How far along its arms a junction is looked at, metres."""

@@ -7,13 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
 from predmapnet.demo_world.town.cross_sections import CrossSection, Use
 from predmapnet.demo_world.town.reference_line import ReferenceLine
-
-Float = NDArray[np.float64]
 
 
 class Kerbside(NamedTuple):

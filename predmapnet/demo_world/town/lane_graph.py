@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import DRIVEN, CrossSection
 from predmapnet.demo_world.town.reference_line import ReferenceLine
-
-Float = NDArray[np.float64]
 
 WIDE_ENOUGH = 2.0
 """A lane is open where it is at least this wide, metres."""

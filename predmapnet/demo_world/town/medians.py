@@ -12,8 +12,6 @@ from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.world import Hatching
 
-Float = NDArray[np.float64]
-
 
 def _wide_runs(wide: NDArray[np.bool_]) -> list[slice]:
     """Slices of the runs of True that are longer than two."""

@@ -8,10 +8,9 @@ from functools import cached_property
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 STEP = 2.0
 """Distance between the samples of a reference line, metres."""

@@ -7,14 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import ACTIVE, PAIRED, CrossSection, Strip, Use
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.world import Divider, LineStyle
-
-Float = NDArray[np.float64]
 
 SPACING = 1.0
 """Between the places of a street that are looked at, metres."""

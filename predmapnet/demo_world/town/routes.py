@@ -10,6 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.town.driving import (
     FRONT_OVERHANG,
@@ -23,8 +24,6 @@ from predmapnet.demo_world.town.lane_graph import Carriageway
 from predmapnet.demo_world.town.mirror import mirrored
 from predmapnet.demo_world.town.town import Town
 from predmapnet.demo_world.world import Trajectory
-
-Float = NDArray[np.float64]
 
 SHORTEST_DRIVE = 60.0
 """Metres that the car covers in every scene."""

@@ -8,11 +8,9 @@ from enum import StrEnum
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.reference_line import ReferenceLine, draw_curvature, grow_line, reverse_and_join
-
-Float = NDArray[np.float64]
 
 TOWN_CENTRE = np.array([400.0, 400.0])
 """Where every town lies in the global frame, metres: all coordinates stay positive."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from predmapnet.demo_world.town.assembly import assemble
 from predmapnet.demo_world.town.bays import shape_street
@@ -24,8 +23,6 @@ from predmapnet.demo_world.town.road_paint import paint_street
 from predmapnet.demo_world.town.street_plan import Rank, Street, StreetPlan, plan_streets
 from predmapnet.demo_world.town.works import Stretch, Works, spaced
 from predmapnet.demo_world.world import LineStyle, VectorMap
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

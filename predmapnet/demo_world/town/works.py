@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.junctions import ArmReach
 from predmapnet.demo_world.town.lane_graph import Carriageway
 from predmapnet.demo_world.world import Crossing, Divider, Hatching
-
-Float = NDArray[np.float64]
 
 
 @dataclass

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.scenes import Rig
-
-Float = NDArray[np.float64]
 
 
 def painted_points(renderer: Renderer, spacing: float = 0.5) -> Float:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tests.predmapnet.network.small_baseline import small_config
 
 import predmapnet as pmn
 from predmapnet.config import PredMapNetConfig
@@ -24,7 +25,6 @@ from predmapnet.network.state import FrameInputs, Instances
 from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import Checkpoint, load_checkpoint
 from tests.predmapnet.network.paper_network import opened, tiny_config
-from tests.predmapnet.network.small_baseline import small_config
 
 TOLERANCE = 1e-3
 
