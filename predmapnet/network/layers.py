@@ -150,8 +150,8 @@ def sine_code(positions: Tensor, frequencies: int) -> Tensor:
 
 def interleaved_sines(values: Tensor, width: int) -> Tensor:
     """Encode numbers ``(...)`` by ``(..., width)`` sines and cosines in turns, of periods rising to 10,000."""
-    exponents = torch.arange(0, width, 2, device=values.device, dtype=torch.float32) / width
-    angles = values[..., None] / 10000.0**exponents
+    steps = torch.arange(0, width, 2, device=values.device, dtype=torch.float32)
+    angles = values[..., None] * torch.exp(steps * (-math.log(10000.0) / width))
     return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
