@@ -1,4 +1,4 @@
-"""How good a fused map is, against the true one: the figures of the comparison table."""
+"""Quality of a fused map against the true one: the figures of the comparison table."""
 
 from __future__ import annotations
 

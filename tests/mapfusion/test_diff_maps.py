@@ -1,4 +1,4 @@
-"""What a map lost, gained and moved, whatever the elements that its lines are cut into."""
+"""Diffs: lines removed, added and moved, whatever the elements that they are cut into."""
 
 from __future__ import annotations
 

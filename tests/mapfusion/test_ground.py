@@ -1,4 +1,4 @@
-"""What could not be seen is no evidence; what could be seen and was not there is."""
+"""Visible ground: a missing detection counts against an element only where it could have been seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of one drive over a real road, and the table of it."""
+"""Figures of one drive over a real road, and their table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of the painted road in view is hidden behind things: the measure of how hard a scene is to see."""
+"""Share of the painted road in view that is hidden behind things: how hard a scene is to see."""
 
 from __future__ import annotations
 

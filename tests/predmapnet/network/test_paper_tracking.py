@@ -1,4 +1,4 @@
-"""Which queries are carried forward: the thresholds tau_d and tau_t of Sec. 3.1 with the values of Sec. 4.1."""
+"""Queries that are carried forward: the thresholds tau_d and tau_t of Sec. 3.1 with the values of Sec. 4.1."""
 
 from dataclasses import replace
 
