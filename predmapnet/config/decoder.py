@@ -75,7 +75,7 @@ class PointDecoderConfig(AttentionSection):
 
 
 class DecoderQuirks(Quirks):
-    """What the decoder and the propagation of the official MapTracker do oddly.
+    """Oddities of the decoder and the propagation of the official MapTracker.
 
     Attributes:
         tracks_moved_from_chosen_history: tracks are moved by the motion since the nearest BEV map that was chosen

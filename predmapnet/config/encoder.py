@@ -58,7 +58,7 @@ class WholeImageConfig(Section):
 ImageConfig = Annotated[
     Annotated[ImageWindowConfig, Tag("window")] | Annotated[WholeImageConfig, Tag("whole")], kind_of("window")
 ]
-"""What the network sees of each camera."""
+"""Part of each image that the network sees, and its size."""
 
 
 class SmallBackboneConfig(Section):
@@ -125,7 +125,7 @@ class LookupBevConfig(Section):
 
 
 class EncoderQuirks(Quirks):
-    """What the BEV encoder of the official MapTracker does oddly.
+    """Oddities of the BEV encoder of the official MapTracker.
 
     Attributes:
         mirrored_self_attention: the BEV self-attention looks around the cell mirrored in y, since its reference

@@ -43,7 +43,7 @@ class AttentionSection(Section):
 
 
 class Quirks(Section):
-    """Base of what the official code of MapTracker does oddly, part by part.
+    """Base of the oddities of the official code of MapTracker, part by part.
 
     Its released weights need all of it; a network trained from scratch does not.
     """

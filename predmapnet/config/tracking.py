@@ -1,4 +1,4 @@
-"""Which tracks live on, and which come back."""
+"""Rules by which tracks live on, and come back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from predmapnet.config.section import Fraction, Metres, Positive, Section
 
 
 class TrackingConfig(Section):
-    """Which rows live on (Sec. 3.1) and how tracks and detections of one instance become one row.
+    """Rules by which rows live on (Sec. 3.1) and tracks and detections of one instance become one row.
 
     Attributes:
         tau_d: a detection scored above it is born as a track.

@@ -60,7 +60,7 @@ def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class _Header:
-    """What the segments before the pixels of a JPEG say.
+    """Header of a JPEG: the segments before its pixels.
 
     Attributes:
         pixels: position where the pixels begin, past thumbnails and comments that have end markers of their own.

@@ -24,7 +24,7 @@ _OPTICAL_TO_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the cameras of one kind of rig look.
+    """Directions of the cameras of one kind of rig.
 
     Attributes:
         yaws: degrees to the left of the car's heading, the first one ahead.
@@ -75,7 +75,7 @@ def sample_rig(seed: int) -> Rig:
 
 @dataclass(frozen=True)
 class _Car:
-    """What the cameras of one car have in common.
+    """Common properties of the cameras of one car.
 
     Attributes:
         height: of the cameras above the road, metres.

@@ -18,7 +18,7 @@ from mapfusion.arrays import Float
 
 
 class LineStyle(StrEnum):
-    """How a divider is painted."""
+    """Paint of a divider."""
 
     SOLID = "solid"
     DASHED = "dashed"
@@ -28,7 +28,7 @@ class LineStyle(StrEnum):
 
 
 class CrossingStyle(StrEnum):
-    """How a pedestrian crossing is painted."""
+    """Paint of a pedestrian crossing."""
 
     ZEBRA = "zebra"
     """Bars along the direction of travel of the cars."""
@@ -87,7 +87,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class VectorMap:
-    """What is true about the road, the source of all ground truth.
+    """The true road, the source of all ground truth.
 
     Attributes:
         road_segments: drivable surface; islands and medians are holes (or gaps).
@@ -117,7 +117,7 @@ class VectorMap:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the ego car is at each key frame.
+    """Poses of the ego car at the key frames.
 
     Attributes:
         timestamps: ``(n,) int64``, nanoseconds.

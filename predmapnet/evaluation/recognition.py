@@ -1,4 +1,4 @@
-"""What results are of: the region of their elements, the split of their scenes, and what a reader must know of both."""
+"""Recognition of results: the region of their elements, the split of their scenes, and warnings of both."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ WindowPixels = NDArray[np.uint8] | NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ImageWindow:
-    """How one camera's image is scaled and where the network's window lies in it.
+    """Scale of one camera's image and place of the network's window in it.
 
     Attributes:
         scaled_width, scaled_height: pixels after scaling.

@@ -12,7 +12,7 @@ from predmapnet.network.maptracker.vector_memory import RecalledQueries
 
 @dataclass
 class DecoderInput:
-    """What the decoder starts from; rows are ``T`` tracks, then ``Q`` detections.
+    """Start of the decoder; rows are ``T`` tracks, then ``Q`` detections.
 
     Attributes:
         queries: ``(B, T + Q, C)``.
@@ -36,7 +36,7 @@ class DecoderInput:
 
 
 class MapDecoder(nn.Module):
-    """What every map decoder offers: from rows and the finest BEV level to polylines.
+    """Base of the map decoders: from rows and the finest BEV level to polylines.
 
     Attributes:
         learns_start: gradient flows from the first layer into the reference points that it starts from; otherwise

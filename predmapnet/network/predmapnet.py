@@ -90,7 +90,7 @@ class PredMapNet(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """The device of the parameters."""
         return self.query_generator.content.device
 
     def view_geometry(self, calibration: Calibration, size: tuple[int, int] | None = None) -> ViewGeometry:

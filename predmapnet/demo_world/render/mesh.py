@@ -18,7 +18,7 @@ MOST_CORNERS = 8
 
 
 class Material(IntEnum):
-    """How a face is shaded."""
+    """Shading of a face."""
 
     PLAIN = 0
     FACADE = 1

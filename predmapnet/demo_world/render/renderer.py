@@ -1,4 +1,4 @@
-"""What a camera sees: images with exact depth of a world, at any resolution."""
+"""Renderer: images of a world with exact depth, at any resolution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a car's cameras turn light into bytes: exposure, white balance and tone curve."""
+"""Camera response, from light to bytes: exposure, white balance and tone curve."""
 
 from __future__ import annotations
 

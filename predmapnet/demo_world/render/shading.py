@@ -1,4 +1,4 @@
-"""What a sample looks like: the ground's texture, the sky, walls, cars and leaves, in linear light."""
+"""Shading of a sample: the ground's texture, the sky, walls, cars and leaves, in linear light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where things that stand on the ground darken it: outlines of their feet and of the shadows they cast."""
+"""Shadows on the ground: outlines of the feet of things that stand there, and of the shadows they cast."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a street looks like across: strips side by side whose widths change along the way."""
+"""Cross-sections of streets: strips side by side whose widths change along the way."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ACTIVE = 0.6
 
 
 class Use(StrEnum):
-    """What a strip is for."""
+    """Use of a strip."""
 
     LANE = "lane"
     BUS = "bus"

@@ -1,4 +1,4 @@
-"""How a car follows a path: arcs that join lanes, speeds that a person would drive, and the poses that follow."""
+"""Drives along a path: arcs that join lanes, speeds that a person would drive, and the poses that follow."""
 
 from __future__ import annotations
 

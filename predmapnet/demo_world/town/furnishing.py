@@ -1,4 +1,4 @@
-"""What stands and lies along a stretch of street besides paint: medians, openings of the kerb, parking and lanes."""
+"""Furnishing of a stretch of street besides its paint: medians, openings of the kerb, parking and lanes."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def furnish(
 
 
 def _parking_places(line: ReferenceLine, section: CrossSection, stations: Float) -> list[Polygon]:
-    """Where cars are parked, in pieces short enough to be straight."""
+    """Parking areas, in pieces short enough to be straight."""
     edges = section.edges(stations)
     found = []
     for row, strip in enumerate(section.strips):

@@ -1,4 +1,4 @@
-"""Where streets meet: the paved outline, the curve of each corner, and how far a junction reaches along its arms."""
+"""Junctions: the paved outline, the curve of each corner, and how far a junction reaches along its arms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FLAT = np.radians(152.0)
 
 @dataclass
 class ArmReach:
-    """How far a junction reaches along one arm; distances from the node, metres.
+    """Reach of a junction along one arm; distances from the node, metres.
 
     Attributes:
         arm: which.

@@ -14,7 +14,7 @@ from predmapnet.demo_world.town.reference_line import ReferenceLine
 
 
 class Kerbside(NamedTuple):
-    """What lies along one kerb: pieces of paved ground to be added, and places where cars are parked."""
+    """Ground along one kerb: pieces of pavement to be added, and places where cars are parked."""
 
     paved: list[Polygon]
     parking: list[Polygon]

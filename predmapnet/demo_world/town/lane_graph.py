@@ -1,4 +1,4 @@
-"""Where cars can drive: the lanes of each stretch of street, by direction."""
+"""Lane graph: the lanes of each stretch of street, by direction."""
 
 from __future__ import annotations
 

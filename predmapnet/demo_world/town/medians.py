@@ -1,4 +1,4 @@
-"""What lies between the directions: raised medians as islands, and painted gaps as hatched areas."""
+"""Medians between the directions: raised ones as islands, and painted gaps as hatched areas."""
 
 from __future__ import annotations
 

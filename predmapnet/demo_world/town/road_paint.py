@@ -22,7 +22,7 @@ SHORTEST = 3.0
 
 
 class _Line(NamedTuple):
-    """What one place of a line is: a divider or only paint, and how it looks."""
+    """One place of a line: a divider or only paint, and its looks."""
 
     is_divider: bool
     style: LineStyle
@@ -119,7 +119,7 @@ def _stretches(kinds: list[_Line | None]) -> list[tuple[int, int]]:
 
 
 def _changes(kinds: list[_Line | None], stations: Float) -> tuple[tuple[float, LineStyle], ...]:
-    """Where along a line another style of paint begins, metres from its start."""
+    """Changes of the style of paint along a line, metres from its start."""
     found = []
     for index in range(1, len(kinds)):
         before, this = kinds[index - 1], kinds[index]
@@ -131,7 +131,7 @@ def _changes(kinds: list[_Line | None], stations: Float) -> tuple[tuple[float, L
 def _kind(
     section: CrossSection, left: Strip, right: Strip, station: float, stops: tuple[float, float], habits: Habits
 ) -> _Line | None:
-    """What lies between two neighbouring strips at a station, the left one as seen along the stations."""
+    """The line between two neighbouring strips at a station, the left one as seen along the stations."""
     pair = {left.use, right.use}
     if left.use in PAIRED and right.use in PAIRED:
         if Use.TURNS in pair:

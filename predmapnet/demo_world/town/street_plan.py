@@ -23,7 +23,7 @@ SMALLEST_ANGLE = np.radians(34.0)
 
 
 class Rank(StrEnum):
-    """How important a street is."""
+    """Importance of a street."""
 
     ARTERIAL = "arterial"
     COLLECTOR = "collector"

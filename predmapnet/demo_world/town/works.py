@@ -1,4 +1,4 @@
-"""What is built of a town stretch by stretch, before it is assembled into a map."""
+"""Works: the parts of a town, built stretch by stretch before they are assembled into a map."""
 
 from __future__ import annotations
 

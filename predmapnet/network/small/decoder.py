@@ -138,7 +138,7 @@ def sample_bev(bev: Tensor, positions: Tensor) -> Tensor:
 
 
 def visible_rows(track_valid: Tensor, queries: int, one_way: bool) -> Tensor:
-    """Which rows each row may attend to in the decoder: ``(B, T + Q, T + Q) bool``.
+    """Return which rows each row may attend to in the decoder: ``(B, T + Q, T + Q) bool``.
 
     Args:
         track_valid: ``(B, T) bool``; padded rows are seen by nobody.
