@@ -89,11 +89,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class MapDiff:
-    """Differences between two maps.
+    """Differences between two maps, by change and kind, in the order of the maps.
 
-    Attributes:
-        differences: by change and kind, in the order of the maps.
-        alignment: how the new map was brought onto the old one; ``certain`` is False where it was left as it is.
+    ``alignment`` is how the new map was brought onto the old one; not ``certain`` where it was left as it is.
     """
 
     differences: tuple[Difference, ...]
@@ -162,9 +160,7 @@ def write_diff(
 ) -> None:
     """Write a diff as GeoJSON: LineStrings (crossings Polygons) with ``change``, ``kind``, ``length_m``, ``moved_m``.
 
-    Raises:
-        ValueError: coordinates that are not on the globe.
-        OSError: the file cannot be written.
+    Raises ValueError for coordinates that are not on the globe, OSError if the file cannot be written.
     """
     features = [_feature(item, georeference) for item in difference.differences]
     origin = origin_of(provenance or {}, georeference)

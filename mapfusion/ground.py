@@ -39,12 +39,9 @@ metres."""
 
 @dataclass(frozen=True)
 class CameraSector:
-    """Horizontal sector that a camera looks at, without a far end.
+    """Horizontal sector that a camera looks at, without a far end: from a position ``(2,)``, metres, ego frame.
 
-    Attributes:
-        position: ``(2,) float64``, metres, ego frame.
-        heading: of the optical axis, radians from x (forward) towards y (left).
-        field_of_view: horizontal, radians, at most a full turn.
+    The heading of its axis is in radians from x (forward) towards y (left), its field at most a full turn.
     """
 
     position: Float

@@ -29,11 +29,9 @@ from predmapnet.weights.checkpoint import load_checkpoint
 
 @dataclass(frozen=True)
 class CameraImages:
-    """Images of one instant as the network wants them.
+    """Images of one instant as the network wants them: windows ``(N, h, w, 3)``, RGB, 0 to 255, in the rig's order.
 
-    Attributes:
-        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the rig; black where there is no image.
-        valid: ``(N,) bool``.
+    They are black where there is no image (``valid (N,) bool``).
     """
 
     windows: WindowPixels
@@ -164,11 +162,7 @@ class Mapper:
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device of a name; ``auto`` is a GPU if there is one.
-
-    Raises:
-        UserError: there is no such device here.
-    """
+    """Return the device of a name (``auto``: a GPU if there is one); raises UserError where it does not exist."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

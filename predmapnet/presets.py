@@ -86,11 +86,7 @@ PRESETS = {
 
 
 def preset(name: str) -> PredMapNetConfig:
-    """Return a named configuration.
-
-    Raises:
-        UserError: there is no such preset.
-    """
+    """Return a named configuration; raises UserError where there is none of that name."""
     if name not in PRESETS:
         raise UserError(f"there is no preset '{name}'; choose one of: {', '.join(sorted(PRESETS))}")
     return PRESETS[name]
@@ -125,11 +121,7 @@ def _place(location: tuple[int | str, ...]) -> str:
 
 
 def load_config(name_or_path: str | Path) -> PredMapNetConfig:
-    """Return a preset by name, or read a ``.json`` file.
-
-    Raises:
-        UserError: no such preset or file, or the file does not fit.
-    """
+    """Return a preset by name, or read a ``.json`` file; raises UserError where there is none, or it does not fit."""
     path = Path(name_or_path)
     if path.suffix != ".json":
         return preset(str(name_or_path))

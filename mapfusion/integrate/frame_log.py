@@ -17,14 +17,7 @@ JUDGES = 3
 
 @dataclass
 class DriveLog:
-    """Frames of one drive in the order of time.
-
-    Attributes:
-        number: of the drive.
-        times: nanoseconds.
-        positions: of the car, metres, global frame.
-        believed: whether each pose was believed.
-    """
+    """Frames of one drive in the order of time, nanoseconds: positions of the car, metres, and whether believed."""
 
     number: int
     times: list[int] = field(default_factory=list)

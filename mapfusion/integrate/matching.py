@@ -12,12 +12,7 @@ from mapfusion.arrays import Bool, Float, Integer, Rows
 
 
 class DirectedPoints(NamedTuple):
-    """Points of curves with the directions of the curves there.
-
-    Attributes:
-        points: ``(n, 2) float64``, metres.
-        directions: ``(n, 2) float64``, unit.
-    """
+    """Points ``(n, 2)`` of curves, metres, with the unit directions of the curves there."""
 
     points: Float
     directions: Float

@@ -93,11 +93,8 @@ class DecoderQuirks(Quirks):
 class MapTrackerDecoderConfig(AttentionSection):
     """MapTracker's decoder: N_q queries of width C whose lines of N_p points are predicted anew by every layer.
 
-    Each track also attends to its own queries of past frames (the vector memory).
-
-    Attributes:
-        memory_distances: metres back at which past queries are chosen.
-        memory_capacity: frames that are remembered.
+    Each track also attends to those of its own queries, of the last ``memory_capacity`` frames, that lie about
+    ``memory_distances`` metres back (the vector memory).
     """
 
     kind: Literal["maptracker"] = "maptracker"

@@ -91,9 +91,7 @@ class ResidualBevMemoryConfig(Section):
 class EncoderBevMemoryConfig(Section):
     """Past BEV maps enter the BEV encoder after each of its layers (MapTracker's BEV memory fusion).
 
-    Attributes:
-        distances: metres back at which maps are chosen.
-        capacity: frames that are remembered.
+    Of the last ``capacity`` frames, those are chosen that lie about so many metres back.
     """
 
     distances: Distances = (1.0, 5.0, 10.0, 15.0)
@@ -191,8 +189,7 @@ BevConfig = Annotated[
 class SegmentationConfig(Section):
     """The segmentation of the ground at twice the resolution of the BEV grid.
 
-    Attributes:
-        kind: ``pixel_shuffle`` computes on the BEV grid, ``upsampling`` (MapTracker) on the finer one.
+    ``pixel_shuffle`` computes on the BEV grid, ``upsampling`` (MapTracker) on the finer one.
     """
 
     kind: Literal["pixel_shuffle", "upsampling"] = "pixel_shuffle"

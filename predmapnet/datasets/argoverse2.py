@@ -205,22 +205,12 @@ class Argoverse2Source:
 
 
 class Argoverse2Scene:
-    """One Argoverse 2 sensor log.
-
-    Attributes:
-        info: the log's line in the listing.
-        georeference: of its city.
-        timestamps: ``(n,) int64``, nanoseconds, of the key frames.
-    """
+    """One Argoverse 2 sensor log; its key frames are at ``timestamps (n,) int64``, nanoseconds."""
 
     georeference: Georeference | None
 
     def __init__(self, folder: Path, info: SceneInfo, timestamps: Integer) -> None:
-        """Read the poses at time stamps ``(n,)``, nanoseconds; all else is read when it is asked for.
-
-        Raises:
-            UserError: poses are missing or damaged.
-        """
+        """Read the poses at time stamps ``(n,)``, nanoseconds, all else when it is asked for; raises UserError."""
         self.info = info
         self.georeference = argoverse2_georeference(info.location)
         self.timestamps = timestamps

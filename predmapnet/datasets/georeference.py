@@ -38,12 +38,7 @@ POINT_NEMO = (-48.8767, -123.3933)
 
 @dataclass(frozen=True)
 class SphereGeoreference:
-    """Bearing and distance from an origin on a sphere of the equatorial radius, as the nuScenes devkit exports.
-
-    Attributes:
-        name: of the map.
-        latitude, longitude: of the frame's origin, degrees.
-    """
+    """Bearing and distance from an origin, degrees, on a sphere of the equatorial radius, as in the nuScenes devkit."""
 
     name: str
     latitude: float
@@ -66,13 +61,7 @@ class SphereGeoreference:
 
 @dataclass(frozen=True)
 class UtmGeoreference:
-    """A city frame that is UTM shifted to an origin, as Argoverse 2 defines it.
-
-    Attributes:
-        name: of the city.
-        latitude, longitude: of the frame's origin, degrees.
-        zone: UTM zone, northern hemisphere.
-    """
+    """A city frame that is UTM shifted to an origin, degrees, as Argoverse 2 defines it; northern hemisphere."""
 
     name: str
     latitude: float
@@ -95,9 +84,7 @@ class UtmGeoreference:
 class LocalFrame:
     """A frame whose place on Earth is not known: its maps lie about longitude 0 and latitude 0, where no road is.
 
-    Attributes:
-        frame: name of the frame; maps of one frame may be merged.
-        east, north: metres that are taken off first, of frames whose coordinates are large (UTM, for example).
+    Maps of one ``frame`` may be merged; ``east`` and ``north`` are metres taken off large coordinates (as of UTM).
     """
 
     frame: str

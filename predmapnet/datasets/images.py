@@ -60,12 +60,7 @@ def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class _Header:
-    """Header of a JPEG: the segments before its pixels.
-
-    Attributes:
-        pixels: position where the pixels begin, past thumbnails and comments that have end markers of their own.
-        baseline: whether it is a baseline JPEG, as nearly all cameras write.
-    """
+    """Header of a JPEG: where its pixels begin (past thumbnails and comments), and whether it is a baseline JPEG."""
 
     pixels: int
     baseline: bool

@@ -75,11 +75,7 @@ class SensorData(NamedTuple):
 
 @dataclass(frozen=True)
 class Tables:
-    """One ``v1.0-*`` folder.
-
-    Attributes:
-        folder: of the tables.
-    """
+    """One ``v1.0-*`` folder of tables."""
 
     folder: Path
 

@@ -117,12 +117,9 @@ class VectorMap:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses of the ego car at the key frames.
+    """Poses of the ego car at the key frames: ``(n,) int64`` nanoseconds and ``(n, 4, 4) float64``.
 
-    Attributes:
-        timestamps: ``(n,) int64``, nanoseconds.
-        ego_to_global: ``(n, 4, 4) float64``; ego origin on the ground below the rear axle, small pitch and
-            roll included.
+    The ego origin is on the ground below the rear axle; small pitch and roll are included.
     """
 
     timestamps: NDArray[np.int64]

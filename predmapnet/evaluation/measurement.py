@@ -166,11 +166,7 @@ def measure_scene(
     mapping_seconds: float | None = None,
     protocol: Protocol = Protocol.ANCHORED,
 ) -> SceneMeasurement:
-    """Measure one scene: all of its frames in order, and its maps in one global frame where both exist.
-
-    Raises:
-        UserError: the scene has no frame.
-    """
+    """Measure one scene: all of its frames (at least one) in order, and its maps in one frame where both exist."""
     if not frames:
         raise UserError("There is no frame to measure.")
     roi = frames[0].predicted.roi

@@ -16,12 +16,9 @@ _EPSILON = float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True)
 class PrecisionRecallCurve:
-    """Precision over recall of one kind at one threshold, in descending score.
+    """Precision over recall of one kind at one threshold (metres), one entry per prediction in descending score.
 
-    Attributes:
-        threshold: metres.
-        scores, precision, recall: ``(n,) float64``, one entry per prediction.
-        average_precision: area under the monotone envelope of the curve.
+    The average precision is the area under the monotone envelope of the curve.
     """
 
     threshold: float
@@ -33,13 +30,7 @@ class PrecisionRecallCurve:
 
 @dataclass(frozen=True)
 class KindResult:
-    """Average precision of one kind.
-
-    Attributes:
-        kind: of the elements.
-        curves: one per threshold.
-        truths, predictions: numbers of elements.
-    """
+    """Average precision of one kind, with one curve per threshold and the numbers of elements."""
 
     kind: ElementKind
     curves: tuple[PrecisionRecallCurve, ...]

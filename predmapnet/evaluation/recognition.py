@@ -54,11 +54,7 @@ def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
 
 
 def check_region(path: Path, polylines: Sequence[Float], roi: RegionOfInterest) -> None:
-    """Refuse a region that the elements contradict: a wide region without anything outside the standard one is fine.
-
-    Raises:
-        UserError: many vertices lie outside ``roi``.
-    """
+    """Raise UserError for a region that many vertices contradict; a wide one without anything far outside is fine."""
     share = _beyond(np.abs(np.concatenate(polylines)), roi) if polylines else 0.0
     if share >= MANY:
         raise UserError(
@@ -78,8 +74,7 @@ def frames_look_like(names: Iterable[str]) -> str | None:
 def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, int]:
     """Recognise the split of the scenes that are measured; returns it, and how many scenes the data set has of it.
 
-    Raises:
-        UserError: the scenes belong to several splits.
+    Raises UserError for scenes of several splits.
     """
     of = {info.name: info.split for info in infos}
     measured = [of[name] for name in scenes]

@@ -133,7 +133,8 @@ def stability(
         poses_of = np.concatenate([none, *pairs])
         own, rows, kinds = (values[: len(poses_of)] for values in (own, rows, kinds))
     scores = _scores(frames, own, rows)
-    near, alike = localisation_and_shape(*_lines(frames, own, rows, protocol), _poses(frames), poses_of)
+    poses = np.array([frame.predicted.ego_to_global for frame in frames]).reshape(-1, 4, 4)
+    near, alike = localisation_and_shape(*_lines(frames, own, rows, protocol), poses, poses_of)
     there = presence(scores[:, 0], scores[:, 1])
     together = np.clip(weight * near + (1.0 - weight) * alike, 0.0, 1.0)
     return Stability(
@@ -174,7 +175,3 @@ def _lines(
 
 def _first_lines(frames: Sequence[EvaluationFrame]) -> Integer:
     return np.cumsum([0, *(len(frame.predicted) for frame in frames)])
-
-
-def _poses(frames: Sequence[EvaluationFrame]) -> Float:
-    return np.array([frame.predicted.ego_to_global for frame in frames]).reshape(-1, 4, 4)

@@ -28,12 +28,7 @@ WindowPixels = NDArray[np.uint8] | NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ImageWindow:
-    """Scale of one camera's image and place of the network's window in it.
-
-    Attributes:
-        scaled_width, scaled_height: pixels after scaling.
-        top: first row of the window in the scaled image.
-    """
+    """Size of one camera's image after scaling, pixels, and the first row of the network's window in it."""
 
     scaled_width: int
     scaled_height: int

@@ -214,11 +214,9 @@ class FrameOutputs:
 
 @dataclass
 class ImageFeatures:
-    """Features of the images of one instant.
+    """Features ``(B, N, C, h_i, w_i)`` of the images of one instant, fine to coarse.
 
-    Attributes:
-        levels: ``(B, N, C, h_i, w_i)`` each, fine to coarse.
-        depth: ``(B, N, D, h_0, w_0)`` logits of the auxiliary head, in training where it is switched on; else None.
+    In training there may be depth logits ``(B, N, D, h_0, w_0)`` of the auxiliary head.
     """
 
     levels: list[Tensor]

@@ -60,11 +60,9 @@ UNTRAINED_NOTE = (
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a run against the ground truth.
+    """Accuracy of a run against the ground truth: chamfer mAP of the frames, and figures of the global map.
 
-    Attributes:
-        mean_ap: chamfer mAP of the frames at the thresholds of the benchmark.
-        precision, recall: of the global map, length-weighted, at 1.0 m, inside the area that was seen.
+    Precision and recall are length-weighted, at 1.0 m, inside the area that was seen.
     """
 
     mean_ap: float
@@ -106,12 +104,7 @@ class SceneReport:
 
 @dataclass(frozen=True)
 class MappedScene:
-    """Result of a pipeline: the map, its frames and the report.
-
-    Attributes:
-        run: the global map, and the map of each frame without rasters.
-        report: the figures.
-    """
+    """Result of a pipeline: the run (map and frame maps without rasters) and the report of it."""
 
     run: SceneRun
     report: SceneReport

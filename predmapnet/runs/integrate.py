@@ -101,11 +101,7 @@ def integrate_file(
 
 
 def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
-    """Fuse frames, in the order of their times.
-
-    Raises:
-        UserError: there is no frame, or none that can be used.
-    """
+    """Fuse frames in the order of their times; raises UserError where none can be used."""
     ordered = sorted(frames, key=lambda frame: (frame.log, frame.frame_map.timestamp))
     if not ordered:
         raise UserError("there is no frame to integrate")

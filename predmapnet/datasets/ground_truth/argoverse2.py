@@ -59,11 +59,7 @@ class Argoverse2GroundTruth:
     """
 
     def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
-        """Read a map: ``log_map_archive_*.json``, or its content.
-
-        Raises:
-            UserError: the file is missing, damaged, or not a vector map.
-        """
+        """Read ``log_map_archive_*.json``, or its content; raises UserError for anything but a vector map."""
         content, self.fingerprint = read_map_file(map_file)
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:

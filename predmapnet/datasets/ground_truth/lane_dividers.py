@@ -33,14 +33,7 @@ QUADRANT_SEGMENTS = 16
 
 @dataclass(frozen=True)
 class LaneSide:
-    """One boundary of a lane that has a neighbour on that side.
-
-    Attributes:
-        lane: id of the lane.
-        points: ``(n, 3) float64``, metres, city frame.
-        neighbour: id of the lane beyond.
-        predecessors, successors: ids of lanes.
-    """
+    """One boundary ``(n, 3)``, metres, of a lane that has a neighbour on that side; all lanes by their ids."""
 
     lane: int
     points: Float

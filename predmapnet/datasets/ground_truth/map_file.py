@@ -16,8 +16,7 @@ from predmapnet.errors import UserError
 def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
     """Read a map, from a JSON file or its content: the content, and the SHA-256 digest of its bytes.
 
-    Raises:
-        UserError: the file is missing, damaged, or not one JSON object.
+    Raises UserError for a file that is missing, damaged, or not one JSON object.
     """
     if isinstance(source, Mapping):
         return source, hashlib.sha256(orjson.dumps(source)).digest()

@@ -228,11 +228,7 @@ class _Place:
 
 
 def check_version(content: Mapping[str, Any], name: str) -> None:
-    """Refuse an old map expansion as the official devkit does: its maps lie elsewhere, or lack layers.
-
-    Raises:
-        UserError: the version is below 1.3, or there is none.
-    """
+    """Raise UserError for a map expansion below 1.3, as the devkit does: its maps lie elsewhere, or lack layers."""
     version = str(content.get("version", "1.0"))
     if re.fullmatch(r"\d+(\.\d+)*", version) is None or tuple(map(int, version.split("."))) < (1, 3):
         found = f"version {version}" if "version" in content else "no version"

@@ -23,13 +23,7 @@ MINIMUM_IOU = 0.01
 
 @dataclass(frozen=True)
 class TrackFrame:
-    """Polylines of one frame, ready to be tracked.
-
-    Attributes:
-        kinds: ``(n,) int64``.
-        points: ``(n, 20, 2)``, normalised over the region.
-        ego_to_global: ``(4, 4) float64``.
-    """
+    """Polylines ``(n, 20, 2)`` of one frame, normalised over the region, ready to be tracked."""
 
     kinds: Integer
     points: Float

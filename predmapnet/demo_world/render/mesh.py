@@ -7,9 +7,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Float, Integer
 from predmapnet.demo_world.world import Solids
 
 Corners = list[tuple[float, float, float]]
@@ -48,14 +47,14 @@ class Mesh(NamedTuple):
     """
 
     corners: Float
-    counts: NDArray[np.int64]
+    counts: Integer
     normals: Float
-    materials: NDArray[np.int64]
-    owners: NDArray[np.int64]
+    materials: Integer
+    owners: Integer
     colours: Float
     balls: Float
-    ball_materials: NDArray[np.int64]
-    ball_owners: NDArray[np.int64]
+    ball_materials: Integer
+    ball_owners: Integer
     ball_colours: Float
 
 
@@ -63,8 +62,8 @@ class _Template(NamedTuple):
     """Faces of a unit solid (x, y in [-0.5, 0.5], z in [0, 1]); a negative tint means the solid's own colour."""
 
     corners: Float
-    counts: NDArray[np.int64]
-    materials: NDArray[np.int64]
+    counts: Integer
+    materials: Integer
     tints: Float
 
 
@@ -236,7 +235,7 @@ def _select(solids: Solids, row: int) -> _Template:
     return _prism(8) if solids.shape[row] == "cylinder" else _box()
 
 
-def build_mesh(solids: Solids, rows: NDArray[np.int64]) -> Mesh:
+def build_mesh(solids: Solids, rows: Integer) -> Mesh:
     """Turn rows ``(k,)`` of solids into faces; ``owners`` of the mesh refer to rows of ``solids``."""
     flat = [int(row) for row in rows if solids.shape[row] != "ellipsoid"]
     templates = [_select(solids, row) for row in flat]

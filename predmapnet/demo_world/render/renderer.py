@@ -26,12 +26,7 @@ from predmapnet.scenes import Camera, Rig
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """One image of one camera.
-
-    Attributes:
-        image: ``(height, width, 3) uint8``, RGB.
-        depth: ``(height, width) float32``, metres along the optical axis at the pixel's centre, infinite for sky.
-    """
+    """One image ``(height, width, 3) uint8``, RGB, and its depth, metres along the optical axis, infinite for sky."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]

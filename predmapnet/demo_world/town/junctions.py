@@ -40,13 +40,7 @@ class ArmReach:
 
 @dataclass
 class Corner:
-    """The kerb between an arm and the next one anticlockwise.
-
-    Attributes:
-        gap: angle between the two arms, radians.
-        radius: of the kerb, metres.
-        curve: ``(n, 2)`` from the first arm to the next, metres.
-    """
+    """The kerb between an arm and the next one anticlockwise, ``gap`` radians further: ``curve (n, 2)``, metres."""
 
     gap: float
     radius: float

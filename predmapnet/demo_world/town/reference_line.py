@@ -18,12 +18,9 @@ STEP = 2.0
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """A smooth line sampled by arc length. Stations are metres along it, lateral offsets metres to its left.
+    """A smooth line sampled by arc length: points and unit tangents ``(n, 2)`` at stations ``(n,)``.
 
-    Attributes:
-        stations: ``(n,) float64``.
-        points: ``(n, 2) float64``, metres.
-        tangents: ``(n, 2) float64``, unit length.
+    Stations are metres along it, lateral offsets metres to its left.
     """
 
     stations: Float

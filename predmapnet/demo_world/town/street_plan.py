@@ -35,10 +35,7 @@ class Rank(StrEnum):
 class Street:
     """A street while and after it is planned.
 
-    Attributes:
-        line: its reference line.
-        rank: how important it is.
-        stops: (station, node) in order of station; node -1 where the street leaves the town.
+    ``stops`` are its (station, node) in order of station; node -1 where the street leaves the town.
     """
 
     line: ReferenceLine

@@ -18,12 +18,9 @@ from predmapnet.network.state import StreamState
 
 @dataclass
 class PastBevMaps:
-    """Chosen past maps, from far to near.
+    """Chosen past maps, from far to near: ``(B, S, C, H, W)``, and which ``slots`` of the memory they are.
 
-    Attributes:
-        maps: ``(B, S, C, H, W)`` in the current ego frame, zeros where they do not reach and in slots without a map.
-        slots: ``(B, S) int64``, which maps of the memory these are.
-        valid: ``(B, S) bool``.
+    They are in the current ego frame, zeros where they do not reach and in slots without a (valid) map.
     """
 
     maps: Tensor

@@ -54,7 +54,7 @@ class BevSelfAttention(DeformableAttention):
         row, column = self._references(cells.device)
         x = offsets[..., 0].unflatten(0, (batch, count)) + column[:, None, None, None]
         y = offsets[..., 1].unflatten(0, (batch, count)) + row[:, None, None, None]
-        first_row = _stream_rows(batch, count, count, cells.device)
+        first_row = (torch.arange(batch, device=cells.device, dtype=torch.int32) * count).repeat_interleave(count)
         attended = deformable_attention(values, first_row, x.flatten(0, 1), y.flatten(0, 1), weights, [self.grid])
         return cells + self.dropout(self.output(attended.view(batch, count, -1)))
 
@@ -200,11 +200,6 @@ class BevFormer(nn.Module):
             for features, code in zip(levels, self.level_code[: len(levels)], strict=True)
         ]
         return torch.cat(tokens, dim=2)
-
-
-def _stream_rows(batch: int, queries: int, rows: int, device: torch.device) -> Tensor:
-    """Return ``(batch * queries) int32``: where the table of each query's stream begins."""
-    return (torch.arange(batch, device=device, dtype=torch.int32) * rows).repeat_interleave(queries)
 
 
 def _as_map(cells: Tensor, grid: Sequence[int]) -> Tensor:

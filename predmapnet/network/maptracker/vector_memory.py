@@ -105,7 +105,9 @@ def store_queries(
         return torch.cat([kept[:, :, 1:], newest[:, :, None].to(entries.dtype)], dim=2)
 
     if memory.valid.shape[1] == 0:  # A row to take from, for newborn tracks.
-        memory = VectorMemory(**{name: _one_row(entries) for name, entries in vars(memory).items()})
+        memory = VectorMemory(
+            **{name: entries.new_zeros(len(entries), 1, *entries.shape[2:]) for name, entries in vars(memory).items()}
+        )
     rows = queries.shape[1]
     kept_valid = shifted(memory.valid, valid)
     kept_valid[:, :, :-1] &= (matched & valid)[..., None]
@@ -115,7 +117,3 @@ def store_queries(
         frames=shifted(memory.frames, frame[:, None].expand(-1, rows)),
         valid=kept_valid,
     )
-
-
-def _one_row(entries: Tensor) -> Tensor:
-    return entries.new_zeros(entries.shape[0], 1, *entries.shape[2:])

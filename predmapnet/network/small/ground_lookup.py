@@ -21,13 +21,7 @@ NEAREST_DEPTH = 0.1
 
 @dataclass(frozen=True)
 class SparseRows:
-    """A sparse matrix, row by row.
-
-    Attributes:
-        columns: ``(nnz,) int32``.
-        starts: ``(rows,) int32``, where each row begins in ``columns``.
-        weights: ``(nnz,) float32``.
-    """
+    """A sparse matrix, row by row: columns and weights ``(nnz,)``, and where each row begins in them, ``(rows,)``."""
 
     columns: Tensor
     starts: Tensor
