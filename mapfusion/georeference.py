@@ -32,11 +32,9 @@ class Georeference(Protocol):
     @property
     def name(self) -> str:
         """Name of the metric frame, for a file's metadata."""
-        ...
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
-        ...
 
 
 class InvertibleGeoreference(Georeference, Protocol):
@@ -44,4 +42,3 @@ class InvertibleGeoreference(Georeference, Protocol):
 
     def from_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""
-        ...

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 import shapely
@@ -112,13 +112,8 @@ def ground_problem(frame_map: FrameMap) -> str | None:
     return None
 
 
-def frame_ground(frame_map: FrameMap) -> shapely.Geometry:
-    """Return the ground that was looked at in a frame, global frame, metres."""
-    return _placed(_ego_ground(frame_map), frame_map)
-
-
 def seen_along(frame_maps: Iterable[FrameMap]) -> shapely.Geometry:
-    """Return the ground that was looked at on a drive: the union of :func:`frame_ground`, global frame, metres.
+    """Return the ground that was looked at on a drive: the union over its frames, global frame, metres.
 
     Frames that share one ``visible`` (one rig, all cameras there) share its outline, which makes 10,000 of them a
     matter of seconds.
@@ -129,8 +124,8 @@ def seen_along(frame_maps: Iterable[FrameMap]) -> shapely.Geometry:
     for frame_map in frame_maps:
         if last is None or frame_map.visible is not last.visible or frame_map.roi != last.roi:
             ego_ground = _ego_ground(frame_map)
-        last = frame_map
-        grounds.append(_placed(ego_ground, frame_map))
+        last, pose = frame_map, frame_map.ego_to_global
+        grounds.append(shapely.transform(ego_ground, partial(transform_points, pose)))
     return shapely.union_all(grounds)
 
 
@@ -139,10 +134,6 @@ def _ego_ground(frame_map: FrameMap) -> shapely.Geometry:
     if frame_map.visible is None:
         return ground
     return shapely.intersection(ground, ground_within(frame_map.visible))
-
-
-def _placed(ego_ground: shapely.Geometry, frame_map: FrameMap) -> shapely.Geometry:
-    return shapely.transform(ego_ground, lambda points: transform_points(frame_map.ego_to_global, points))
 
 
 def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None) -> shapely.Geometry:

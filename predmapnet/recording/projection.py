@@ -1,12 +1,11 @@
-"""Lines in pictures: densify, project into a camera, cut where they leave it; dashes; BEV pixels."""
+"""Lines in pictures: project into a camera, cut where they leave it; dashes; BEV pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Bool, Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
 from predmapnet.scenes import Camera
@@ -15,15 +14,7 @@ NEAR_METRES = 1.0
 """Points nearer to the camera plane than this are cut off: their projection runs away."""
 
 
-def densify(points: Float, spacing: float) -> Float:
-    """Insert points into a line ``(n, 2)`` so that no step is longer than ``spacing`` metres; vertices stay."""
-    distance = arc_length(points)
-    count = max(2, int(np.ceil(distance[-1] / spacing)) + 1)
-    stations = np.sort(np.concatenate([distance, np.linspace(0.0, distance[-1], count)]))
-    return np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=1)
-
-
-def true_runs(mask: NDArray[np.bool_]) -> list[slice]:
+def true_runs(mask: Bool) -> list[slice]:
     """Return the stretches of at least two consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start >= 2]
@@ -34,7 +25,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
 
     Returns the parts that are seen, ``(k, 2)`` pixels each.
     """
-    dense = densify(points, spacing)
+    dense = shapely.get_coordinates(shapely.segmentize(shapely.LineString(points), spacing))
     lifted = np.column_stack([dense, np.full(len(dense), camera.ground_height)])
     rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
     rays = (lifted - position) @ rotation @ camera.intrinsics.T

@@ -67,7 +67,6 @@ class FrameByFrame(Protocol):
 
     def frame(self, pose: Float, roi: RegionOfInterest, /) -> FrameTruth:
         """Return the truth around one pose."""
-        ...
 
 
 def all_truths(

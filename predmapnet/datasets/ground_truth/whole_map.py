@@ -25,11 +25,9 @@ class MapTruth(Protocol):
 
     def region(self, pose: Float, roi: RegionOfInterest) -> Polygon:
         """Return the rectangle that a frame covers, in the global frame."""
-        ...
 
     def elements_within(self, area: Any) -> list[tuple[ElementKind, Float]]:
         """Return all elements cut by an area, global frame."""
-        ...
 
 
 def truth_map(truth: MapTruth, frames: Sequence[tuple[int, Float]], roi: RegionOfInterest) -> GlobalMap:

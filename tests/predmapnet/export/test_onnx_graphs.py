@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.predmapnet.network.small_baseline import small_config
 
 import predmapnet as pmn
 from predmapnet.config import PredMapNetConfig
