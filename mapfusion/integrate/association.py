@@ -49,13 +49,9 @@ class LineCandidate:
 
 @dataclass(frozen=True)
 class LocalStations:
-    """Stations of all elements of one kind near a frame, end to end.
+    """Stations of all elements of one kind near a frame, end to end, in metres from the box's lower left corner.
 
-    Attributes:
-        elements: ids of the elements.
-        owner: ``(n,)``, which of the elements each station belongs to.
-        row: ``(n,)``, its row in that element.
-        stations: places and directions, metres from the box's lower left corner.
+    ``owner (n,)`` says which of the elements each belongs to, and ``row (n,)`` its row in that element.
     """
 
     elements: Integer
@@ -209,12 +205,9 @@ class LineMatching:
 
 @dataclass(frozen=True)
 class RingCandidates:
-    """Crossings of the map that an observed ring may belong to.
+    """Crossings of the map that an observed ring may belong to: ``overlaps``, intersection over union by their ids.
 
-    Attributes:
-        sighting: the ring on the lattice, with room for itself and all crossings around.
-        low, high: first cell and past the last that the ring itself needs.
-        overlaps: intersection over union by id of the crossing.
+    The sighting has room for the ring, which needs the cells ``low`` to ``high``, and for all of them.
     """
 
     sighting: RingSighting

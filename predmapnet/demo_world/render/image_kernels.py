@@ -320,14 +320,13 @@ def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image
 def develop(
     image: Float32, exposures: Float32, vignette: float, noise: float, seed: int, curve: Byte, out: Byte
 ) -> None:
-    """Expose, add sensor noise and apply the tone curve.
+    """Expose an image ``(height, width, 3)`` of linear radiance, add sensor noise and apply the tone curve: ``out``.
 
     Args:
-        image: ``(height, width, 3)`` linear radiance.
+        image: changed in place.
         exposures: ``(3,)``, factors of red, green and blue.
         vignette: share of light that the corners lose.
-        noise: standard deviation at middle grey.
-        seed: of the noise.
+        noise, seed: standard deviation at middle grey, and of what it is drawn.
         curve: ``(4096,)``, from the square root of linear light (0 to 1.25) to sRGB bytes.
         out: ``(height, width, 3)``.
     """
