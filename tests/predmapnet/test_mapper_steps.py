@@ -158,14 +158,14 @@ def test_cameras_that_do_not_move_are_projected_once_and_others_anew(mapper):
         pose = DEMO_RIG[0].camera_to_ego.copy()
         pose[0, 3] += metres
         rig = (replace(DEMO_RIG[0], camera_to_ego=pose), *DEMO_RIG[1:])
-        return mapper._geometry(calibrate(rig, mapper.config))
+        return mapper.engine._geometry(calibrate(rig, mapper.config))
 
     first = geometry(0.0)
     assert geometry(0.05) is not first
     assert geometry(0.0) is first
     for step in range(20):
         geometry(0.1 + 0.01 * step)
-    assert len(mapper._geometries) <= 8
+    assert len(mapper.engine._geometries) <= 8
     assert geometry(0.0) is not first
 
 
