@@ -10,6 +10,7 @@ import typer
 from cli.options import (
     AllowMissingCameras,
     Compile,
+    Crs,
     DataRoot,
     Dataset,
     Device,
@@ -47,6 +48,7 @@ def infer(
     engine: Engine = EngineKind.TORCH,
     threads: SceneThreads = THREADS_PER_SCENE,
     allow_missing_cameras: AllowMissingCameras = False,
+    crs: Crs = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -59,7 +61,7 @@ def infer(
     name: str | None = scene
     if (folder := folder_named(scene, dataset)) is not None:
         name, (dataset, data_root) = None, folder
-    outputs = Outputs(out, recording, save_frames, force)
+    outputs = Outputs(out, recording, save_frames, force, crs)
     outputs.check()
     frame_origin = None if origin is None else given_origin(origin)
     use_threads(threads)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.options import Force, Json
+from cli.options import Crs, Force, Json
 
 if TYPE_CHECKING:
     from mapfusion.elements import RegionOfInterest
@@ -46,6 +46,7 @@ def integrate(
     normalised: Annotated[
         bool, typer.Option("--normalised", help="The results' points are shares (0 to 1) of the region's sides.")
     ] = False,
+    crs: Crs = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -62,7 +63,7 @@ def integrate(
     from predmapnet.runs.integrate import integrate_file
     from predmapnet.runs.outputs import Outputs
 
-    Outputs(map=out, force=force).check([path for path in (frames, poses) if path is not None])
+    Outputs(map=out, force=force, crs=crs).check([path for path in (frames, poses) if path is not None])
     region = _region(roi)
     if location is not None or origin is not None:
         _georeference(location, origin)  # a wrong option is reported before the work begins
@@ -79,7 +80,7 @@ def integrate(
     }
     provenance.pop(LOCAL_FRAME, None)  # its place is known now
     with value_errors_told():
-        write_map(done.map, out, georeference, provenance)
+        write_map(done.map, out, georeference, provenance, crs)
     elements = {kind.label: len(done.map.of_kind(kind)) for kind in ElementKind}
     metres = {kind.label: done.map.length(kind) for kind in ElementKind}
     if as_json:

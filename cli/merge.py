@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import Force, Json
+from cli.options import Crs, Force, Json
 from cli.workers import Address, EngineOption, Jobs, WorkerKind, open_executor
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def merge(
     engine: EngineOption = WorkerKind.PROCESS,
     address: Address = None,
     style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
+    crs: Crs = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -37,7 +38,7 @@ def merge(
     """
     from cli.console import counted, elements_table, print_json, progress_display, say_warning
     from cli.console import out as screen
-    from mapfusion.formats.by_suffix import check_suffix
+    from mapfusion.formats.by_suffix import check_crs, check_suffix
     from mapfusion.formats.qgis_style import write_styles
     from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
@@ -47,6 +48,7 @@ def merge(
 
     with value_errors_told():
         check_suffix(out)
+        check_crs(out, crs)
     paths = _files(maps, out)
     check_output(out, (), paths, force)
     config, told = MergeConfig(tile=tile), {"version": __version__}
@@ -55,7 +57,8 @@ def merge(
         progress_display() as display,
         open_executor(engine, address, jobs, apart=False) as (executor, _),
     ):
-        report = merge_files([path.absolute() for path in paths], out, config, executor, display.preparing, told)
+        whole = [path.absolute() for path in paths]
+        report = merge_files(whole, out, config, executor, display.preparing, told, crs)
     written = [out, *(write_styles(out) if style else ())]
     if as_json:
         print_json({**asdict(report), "written": written})

@@ -84,6 +84,10 @@ Origin = Annotated[
         show_default=False,
     ),
 ]
+Crs = Annotated[
+    str | None,
+    typer.Option(help="Reference system of a .gpkg or .fgb, as in EPSG:32632. Default: WGS84.", show_default=False),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a map even if it was changed by hand since it was written.")

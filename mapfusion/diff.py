@@ -280,10 +280,10 @@ def _compare_rings(
             limit = max(config.tolerance, config.sure * float(np.hypot(_spread(element), _spread(new[partner]))))
             same = shift <= limit or overlap[i, partner] >= config.ring_overlap
             change, shown = (Change.UNCHANGED, element) if same else (Change.MOVED, new[partner])
-        result.append(Difference(change, kind, shown.points, shown.length, shift, shown.confidence))
+        result.append(Difference(change, kind, shown.points, shown.extent[0], shift, shown.confidence))
     missing = (element for j, element in enumerate(new) if j not in taken_new)
     return result + [
-        Difference(Change.ADDED, kind, element.points, element.length, float("nan"), element.confidence)
+        Difference(Change.ADDED, kind, element.points, element.extent[0], float("nan"), element.confidence)
         for element in missing
     ]
 

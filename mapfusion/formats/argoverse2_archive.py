@@ -19,7 +19,6 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.files import write_whole
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.frame_ties import MEMBER, TiedFrame, ties_of
 from mapfusion.formats.geojson import feature_of, origin_of
@@ -28,6 +27,7 @@ from mapfusion.formats.json_documents import Position, read_document, tied_featu
 from mapfusion.formats.lanelet2 import with_right_side_first
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
+from mapfusion.formats.seal import write_sealed
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 OUTLINE = "outline"
@@ -52,7 +52,7 @@ def write_argoverse2(
         number = numbers.of(element.name)
         (crossings if element.kind.is_ring else lanes)[str(number)] = {"id": number, **_record(element, georeference)}
     archive = {"pedestrian_crossings": crossings, "lane_segments": lanes, "drivable_areas": {}, MEMBER: origin}
-    with write_whole(path) as temporary:
+    with write_sealed(path) as temporary:
         temporary.write_text(json.dumps(archive, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
 from mapfusion.formats.argoverse2_archive import read_argoverse2, write_argoverse2
-from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
+from mapfusion.formats.geodatabase import write_geodatabase
+from mapfusion.formats.geodatabase_reader import geodatabase_box, read_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
 from mapfusion.formats.lanelet2 import write_lanelet
 from mapfusion.formats.lanelet2_reader import read_lanelet
@@ -22,6 +23,7 @@ from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.formats.nuscenes_expansion import read_nuscenes, write_nuscenes
 from mapfusion.formats.opendrive import write_opendrive
 from mapfusion.formats.opendrive_reader import read_opendrive
+from mapfusion.formats.reference_systems import FromDegrees
 from mapfusion.georeference import LOCAL_FRAME, Georeference, InvertibleGeoreference
 
 SUFFIXES = {
@@ -56,6 +58,14 @@ _READERS = {
 }
 
 
+_ONE_SYSTEM = {
+    "GeoJSON": "RFC 7946 allows longitude and latitude (WGS84) alone",
+    "Lanelet2": "its nodes have latitude and longitude",
+    "OpenDRIVE": "it is projected about the origin of the map's frame",
+}
+"""Why a format has one reference system."""
+
+
 def map_suffix(path: Path) -> str | None:
     """Return the ending of a name that stands for a map format, in lower case; None if it has none."""
     return max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len, default=None)
@@ -70,8 +80,27 @@ def check_suffix(path: Path) -> str:
     return SUFFIXES[suffix]
 
 
+def check_crs(path: Path, crs: str | None) -> None:
+    """Check that a map can be written in a reference system, an EPSG code; None is the one of the format.
+
+    Raises:
+        ValueError: the format has only one, or PROJ does not know it.
+    """
+    if crs is None:
+        return
+    name = check_suffix(path)
+    if name not in ("GeoPackage", "FlatGeobuf"):
+        reason = _ONE_SYSTEM.get(name, "its metres are those of the map's own frame")
+        raise ValueError(f"{path}: {name} cannot be written in {crs}: {reason}. Write .gpkg or .fgb for {crs}")
+    FromDegrees(crs)
+
+
 def write_map(
-    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+    global_map: GlobalMap,
+    path: Path,
+    georeference: Georeference,
+    provenance: Mapping[str, Any] | None = None,
+    crs: str | None = None,
 ) -> None:
     """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
 
@@ -83,11 +112,16 @@ def write_map(
         path: file to write; an existing one is replaced.
         georeference: of that frame.
         provenance: what else the file should tell of its origin.
+        crs: reference system of a GeoPackage or FlatGeobuf (``EPSG:32632``); WGS84 without.
 
     Raises:
-        ValueError: an ending that stands for no format, or coordinates not on the globe.
+        ValueError: an ending that stands for no format, coordinates not on the globe, or a system that does not fit.
         OSError: the file cannot be written.
     """
+    check_crs(path, crs)
+    if crs is not None:
+        write_geodatabase(global_map, path, georeference, provenance, crs)
+        return
     _WRITERS[check_suffix(path)](global_map, path, georeference, provenance)
 
 
@@ -100,13 +134,17 @@ class MapWriter:
         path: file to write; its ending says the format.
         georeference: of the metric frame.
         provenance: what the file should tell of its origin.
+        crs: as for :func:`write_map`.
 
     Raises:
         ValueError: an ending that stands for no format.
     """
 
-    def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
-        self._path, self._georeference, self._provenance = path, georeference, provenance
+    def __init__(
+        self, path: Path, georeference: Georeference, provenance: Mapping[str, Any], crs: str | None = None
+    ) -> None:
+        check_crs(path, crs)
+        self._path, self._georeference, self._provenance, self._crs = path, georeference, provenance, crs
         streams = check_suffix(path) == "GeoJSON"
         self._stream = GeoJsonWriter(path, georeference, provenance) if streams else None
         self._elements: list[MapElement] = []
@@ -122,7 +160,8 @@ class MapWriter:
         if self._stream is not None:
             self._stream.__exit__(kind, error, trace)
         elif kind is None:
-            write_map(GlobalMap(tuple(self._elements), self._provenance), self._path, self._georeference)
+            found = GlobalMap(tuple(self._elements), self._provenance)
+            write_map(found, self._path, self._georeference, crs=self._crs)
 
     def write(self, element: MapElement) -> None:
         """Append one element."""

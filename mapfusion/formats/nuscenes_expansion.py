@@ -20,7 +20,6 @@ from uuid import UUID
 import numpy as np
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.files import write_whole
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.frame_ties import MEMBER, TiedFrame, ties_of
 from mapfusion.formats.geojson import feature_of, origin_of
@@ -28,6 +27,7 @@ from mapfusion.formats.identities import all_named
 from mapfusion.formats.json_documents import Position, read_document, tied_feature
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
+from mapfusion.formats.seal import write_sealed
 from mapfusion.georeference import Georeference, InvertibleGeoreference
 
 LAYERS = {
@@ -65,7 +65,7 @@ def write_nuscenes(
     sheet |= {"arcline_path_3": {}, "connectivity": {}, MEMBER: origin | {"ties": ties}}
     for element in all_named(global_map):
         _add(sheet, element.counter_clockwise(), georeference)
-    with write_whole(path) as temporary:
+    with write_sealed(path) as temporary:
         temporary.write_text(json.dumps(sheet, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
 
 

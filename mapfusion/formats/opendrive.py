@@ -22,10 +22,10 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.files import write_whole
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.identities import StableNumbers, all_named
 from mapfusion.formats.lanelet2 import PREFIX
+from mapfusion.formats.seal import write_sealed
 from mapfusion.geometry import arc_length
 from mapfusion.georeference import Georeference
 
@@ -65,7 +65,7 @@ def write_opendrive(
         write = _crossing if element.kind.is_ring else _line
         roads.append(write(element, points, heights, numbers.of(element.name), _user_data(feature)))
     low, high = (function(np.concatenate(corners), axis=0).tolist() for function in (np.min, np.max))
-    with write_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with write_sealed(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write('<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>\n')
         file.write(
             f'  <header revMajor="1" revMinor="7" name="" version="1.00" date={quoteattr(origin["created"])} '

@@ -123,6 +123,7 @@ def merge_files(
     executor: Executor | None = None,
     progress: Progress | None = None,
     provenance: dict[str, Any] | None = None,
+    crs: str | None = None,
 ) -> MergeReport:
     """Merge map files of one city into one file; what is held in memory depends on the tiles, not on the city.
 
@@ -133,6 +134,7 @@ def merge_files(
         executor: aligns and fuses; everything is done here, one after the other, without.
         progress: called as the work goes on.
         provenance: what else the file should tell of its origin.
+        crs: reference system of the file, as of :func:`mapfusion.formats.by_suffix.write_map`.
 
     Raises:
         ValueError: a file that is not a map, maps that lie too far apart, or two maps of the same name.
@@ -146,7 +148,7 @@ def merge_files(
     observed = merge.observed()
     if observed is not None:
         told["observed"] = observed
-    with MapWriter(out, plane, told) as writer:
+    with MapWriter(out, plane, told, crs) as writer:
         for element in merge.elements(executor or Sequential(), progress):
             writer.write(element)
     return merge.report()
@@ -203,7 +205,7 @@ class _Merge:
 
     def _counted(self, element: MapElement) -> MapElement:
         self.counts[element.kind.label] += 1
-        self.metres[element.kind.label] += element.length
+        self.metres[element.kind.label] += element.extent[0]
         return element
 
     def _correct(self, executor: Executor, say: Progress) -> set[int]:
