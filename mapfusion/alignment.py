@@ -136,7 +136,8 @@ def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None =
     common = everything[_nearest(source, target, everything, source.samples.points, COMMON)[0] >= 0]
     overlap = float(source.samples.spacing[common].sum())
     if overlap < config.min_overlap:
-        return _refused(f"only {overlap:.0f} m of lines in common ground", overlap)
+        refusal = f"only {overlap:.0f} m of lines in common ground"
+        return Alignment(np.zeros(2), np.zeros(2), 0.0, overlap=overlap, refusal=refusal)
     centre = source.samples.points[common].mean(axis=0)
     best: Alignment | None = None
     for base in BASES:
@@ -235,10 +236,6 @@ def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentC
     return "", False
 
 
-def _refused(reason: str, overlap: float) -> Alignment:
-    return Alignment(np.zeros(2), np.zeros(2), 0.0, overlap=overlap, refusal=reason)
-
-
 def _alike(first: Float, second: Float) -> Bool:
     """Whether directions ``(n, 2)`` are the same, either way."""
     return np.asarray(np.abs((first * second).sum(axis=1)) > np.cos(np.radians(30.0)))
@@ -247,11 +244,9 @@ def _alike(first: Float, second: Float) -> Bool:
 def _nearest(
     source: Landmarks, target: Landmarks, chosen: Rows, points: Float, reach: float
 ) -> tuple[Integer, Float, Float]:
-    """Return for some samples of the source, moved to ``points``, the nearest target sample of their kind.
+    """Return the nearest target sample of their kind for some samples of the source, moved to ``points``.
 
-    Returns:
-        ``(n,)`` rows of the target, -1 for none or for another direction; ``(n,)`` distances across the line;
-        ``(n, 2)`` unit normals.
+    That is ``(n,)`` rows (-1 for none or for another direction), distances across the line and ``(n, 2)`` unit normals.
     """
     rows = np.full(len(points), -1, dtype=np.int64)
     for kind, (members, tree) in target.trees.items():
@@ -279,9 +274,8 @@ def _step(
 ) -> tuple[Float, Float, float, Bool]:
     """One trimmed Gauss-Newton step.
 
-    Returns:
-        ``(3,)`` change of shift and turn; ``(3, 3)`` information; root mean square residual, metres; ``(n,)`` which of
-        the common samples agree.
+    Returns the change of shift and turn ``(3,)``, its information ``(3, 3)``, the root mean square residual in metres,
+    and which of the common samples agree.
     """
     moved = move(source.samples.points[common], centre, shift, turn)
     rows, across, normal = _nearest(source, target, common, moved, float(np.hypot(reach, config.spacing)))

@@ -126,18 +126,13 @@ def diff_maps(
     plane: InvertibleGeoreference | None = None,
     config: DiffConfig | None = None,
 ) -> MapDiff:
-    """Compare two maps in one metric frame.
+    """Compare two maps in one metric frame, to which ``plane`` leads from the degrees of the ground that they observed.
 
     Lines are compared sample by sample along their length; a stretch of the new map is the partner of one
     stretch of the old one only, so that a double line that became a single one shows. What lies farther off than
     :attr:`DiffConfig.tolerance` has moved, unless that is within what the maps state of their own uncertainty. What
     the old map has and the new one lacks is removed where the new map's drive has looked
     (:func:`mapfusion.ground.coverage`), else unobserved.
-
-    Args:
-        old, new: the maps, metres.
-        plane: leads from degrees to that frame, for maps that say what ground they observed.
-        config: what counts as a change.
     """
     config = config or DiffConfig()
     ground = coverage(new, plane)

@@ -77,11 +77,7 @@ class Mapper:
 
     @classmethod
     def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
-        """Load a network; without options the shipped weights.
-
-        Raises:
-            UserError: the weights, the device or a compiler are not there.
-        """
+        """Load a network; without options the shipped weights. Raises UserError without weights, device or compiler."""
         options = options or NetworkOptions()
         if options.engine is EngineKind.ONNX or (options.weights is not None and options.weights.is_dir()):
             from predmapnet.export.engine import OnnxEngine

@@ -179,8 +179,7 @@ class LineMatching:
     def take(self, number: int, chosen: LineCandidate) -> tuple[list[int], list[int]]:
         """Mark the chosen stretch as taken; return the other elements beside the observation.
 
-        Returns:
-            Those that the frame shows, too, and the rest, which may be the same line as the chosen one.
+        First those that the frame shows, too, then the rest, which may be the same line as the chosen one.
         """
         shown: list[int] = []
         twins: list[int] = []

@@ -41,15 +41,11 @@ class FusedLine:
 
 
 def fuse(line: FusedLine, new: StationCurve, match: Correspondence) -> list[StationCurve]:
-    """Fuse a curve into a line that it lies beside, in place.
+    """Fuse a curve (an observation, or another line of the map) into a line that it lies beside, in place.
 
     Where both lie side by side, each station moves across the line to the mean weighted by information. Where the
-    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch.
-
-    Args:
-        line: of the map.
-        new: an observation, or the curve of another line of the map.
-        match: stations of the line (at least one) beside vertices of ``new``.
+    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch. The
+    match has at least one station.
 
     Returns:
         The parts of ``new`` that leave the line sideways and belong to another line.

@@ -58,10 +58,7 @@ class MergeReport:
 def short_names(paths: Sequence[Path]) -> list[str]:
     """Return names of files: their stems, with as many folders before as it takes to tell them apart.
 
-    The same map in two formats is told apart by the endings.
-
-    Raises:
-        ValueError: the same file is given twice.
+    The same map in two formats is told apart by the endings; ValueError if the same file is given twice.
     """
     deepest = max((len(path.parts) for path in paths), default=0)
     names: list[str] = []

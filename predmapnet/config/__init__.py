@@ -27,7 +27,6 @@ from predmapnet.config.encoder import (
     ImageConfig,
     ImageWindowConfig,
     LookupBevConfig,
-    ResidualBevMemoryConfig,
     SegmentationConfig,
     SmallBackboneConfig,
     WholeImageConfig,
@@ -51,7 +50,6 @@ __all__ = [
     "MaskConfig",
     "PointDecoderConfig",
     "PredMapNetConfig",
-    "ResidualBevMemoryConfig",
     "RevivalConfig",
     "SegmentationConfig",
     "SemanticQueriesConfig",
@@ -98,6 +96,11 @@ class PredMapNetConfig(Section):
     def mask_size(self) -> tuple[int, int]:
         """Rows and columns of instance masks and history maps."""
         return self.bev.rows // self.bev.mask_stride, self.bev.columns // self.bev.mask_stride
+
+    @property
+    def mask_level(self) -> int:
+        """Which of the BEV levels, fine to coarse, has the cells of the masks."""
+        return self.bev.mask_stride - 1
 
     def to_json(self) -> str:
         """Return the configuration as JSON, for provenance; :func:`predmapnet.presets.parse_config` reads it back."""

@@ -277,9 +277,7 @@ class Argoverse2Scene:
     def frame(self, index: int) -> Frame:
         """Return frame ``index``: pose at exactly the sweep's time stamp, nearest image of each camera within 25 ms.
 
-        Raises:
-            IndexError: no such frame.
-            UserError: no calibration, no images, or a pose is missing or broken.
+        Raises IndexError, and UserError without calibration, images or a whole pose.
         """
         instant = self.instant(index)
         images = {name: _nearest(*self._images[name], instant.timestamp) for name in ARGOVERSE2_CAMERAS}

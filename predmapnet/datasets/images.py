@@ -26,8 +26,7 @@ _END_OR_STRAY = re.compile(rb"\xff[^\x00\xff\xd0-\xd7\xda\xc4\xdb-\xdd\xe0-\xef\
 def read_image(path: Path) -> NDArray[np.uint8]:
     """Read a JPEG or PNG file as ``(height, width, 3) uint8``, RGB; its EXIF orientation is not applied.
 
-    Raises:
-        UserError: the file is missing, empty, cut short, damaged or not an image.
+    Raises UserError for a file that is missing, empty, cut short, damaged or not an image.
     """
     try:
         data = path.read_bytes()

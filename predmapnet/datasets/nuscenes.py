@@ -282,12 +282,7 @@ class NuScenesScene:
         return self._sensor_poses[token]
 
     def instant(self, index: int) -> Instant:
-        """Return token, time stamp and pose of frame ``index``, as :meth:`frame` does.
-
-        Raises:
-            IndexError: no such frame.
-            UserError: a pose is missing, not finite or not rigid.
-        """
+        """Return token, time stamp and pose of frame ``index``; raises as :meth:`frame` does."""
         if not 0 <= index < len(self._frames):
             raise IndexError(f"{self.info.name} has {len(self._frames)} frames, not a frame {index}")
         ego_to_global, lidar_to_ego = self._poses(index)

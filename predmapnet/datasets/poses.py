@@ -42,8 +42,7 @@ def combined(outer: Float, inner: Float) -> Float:
 def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], where: str) -> Float:
     """Build a pose ``(4, 4) float64`` from a quaternion w, x, y, z and a translation, metres.
 
-    Raises:
-        UserError: a value is missing, not finite, or the quaternion is not a rotation; ``where`` is in the message.
+    Raises UserError, naming ``where``, for values that are missing or not finite, and for no rotation.
     """
     try:
         quaternion = np.array(rotation_wxyz, dtype=np.float64).reshape(4)

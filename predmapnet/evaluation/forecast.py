@@ -17,6 +17,7 @@ import shapely
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import clip_line, inverse_pose, resample, transform_points
+from mapfusion.ground import region
 from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
 
@@ -50,7 +51,7 @@ class ForecastErrors:
 def forecast_errors(frames: Sequence[EvaluationFrame]) -> ForecastErrors:
     """Measure all forecasts of one scene; its first frame has no past ego motion and is left out."""
     collected: tuple[list[list[float]], ...] = tuple([] for _ in HORIZONS)
-    targets = [_targets(frame) for frame in frames]
+    targets = [*map(_targets, frames), *({} for _ in range(max(HORIZONS)))]
     for now in range(1, len(frames)):
         predicted = frames[now].predicted
         if predicted.forecasts is None:
@@ -63,11 +64,7 @@ def forecast_errors(frames: Sequence[EvaluationFrame]) -> ForecastErrors:
             line = resample(predicted.polylines[row], POINTS)
             forecast = resample(predicted.forecasts[row], POINTS)
             for horizon, errors in zip(HORIZONS, collected, strict=True):
-                target = (
-                    targets[now + horizon].get((kind, int(predicted.track_ids[row])))
-                    if (now + horizon < len(frames))
-                    else None
-                )
+                target = targets[now + horizon].get((kind, int(predicted.track_ids[row])))
                 if target is not None:
                     moved = _moved(line, np.linalg.matrix_power(motion, horizon), kind, predicted.roi)
                     candidates = (line + horizon * (forecast - line), line, moved)
@@ -115,8 +112,7 @@ def _moved(line: Float, motion: Float, kind: ElementKind, roi: RegionOfInterest)
     """Move a polyline into the next ego frame and clip it to the ROI; unclipped if nothing of it stays inside."""
     moved = transform_points(motion, line)
     if kind.is_ring:
-        box = shapely.box(-roi.length / 2, -roi.width / 2, roi.length / 2, roi.width / 2)
-        inside = shapely.get_parts(shapely.intersection(shapely.make_valid(shapely.Polygon(moved)), box))
+        inside = shapely.get_parts(shapely.intersection(shapely.make_valid(shapely.Polygon(moved)), region(roi)))
         polygons = [part for part in inside if part.geom_type == "Polygon" and not part.is_empty]
         parts = [shapely.get_coordinates(polygon.exterior) for polygon in polygons]
     else:

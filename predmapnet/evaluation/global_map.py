@@ -9,7 +9,8 @@ whole elements are counted inside the union of the regions of interest along the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import shapely
@@ -304,18 +305,9 @@ def _check_finite(which: str, vector_map: GlobalMap) -> None:
 
 def _sum(qualities: Iterable[KindQuality]) -> KindQuality:
     parts = list(qualities)
-    return KindQuality(
-        right=sum((part.right for part in parts), np.zeros(len(THRESHOLDS))),
-        found=sum((part.found for part in parts), np.zeros(len(THRESHOLDS))),
-        predicted=sum(part.predicted for part in parts),
-        true=sum(part.true for part in parts),
-        lateral_errors=np.concatenate([np.zeros(0), *(part.lateral_errors for part in parts)]),
-        fragments=sum(part.fragments for part in parts),
-        followed=sum(part.followed for part in parts),
-        duplicates=sum(part.duplicates for part in parts),
-        predicted_elements=sum(part.predicted_elements for part in parts),
-        true_elements=sum(part.true_elements for part in parts),
-    )
+    names = [each.name for each in fields(KindQuality) if each.name != "lateral_errors"]
+    totals: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names}
+    return KindQuality(**totals, lateral_errors=np.concatenate([part.lateral_errors for part in parts]))
 
 
 def _ratio(part: Float, whole: float) -> Float:

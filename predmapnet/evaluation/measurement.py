@@ -201,10 +201,9 @@ def measure_scene(
 
 
 def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
-    """Pool scenes; their order breaks ties of scores.
+    """Pool scenes (at least one); their order breaks ties of scores.
 
-    Raises:
-        UserError: there is no scene, or the scenes were mapped with different regions of interest or weights.
+    Raises UserError where they were mapped with different regions of interest or weights.
     """
     if not scenes:
         raise UserError("There is no scene to measure.")

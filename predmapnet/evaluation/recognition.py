@@ -29,8 +29,7 @@ _OVERLAP = {
 def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
     """Recognise the region for which elements (``(k, 2)`` each, metres, ego frame) were made.
 
-    Raises:
-        UserError: the axes are not x forward and y left, or the elements fit neither region of the benchmarks.
+    Raises UserError where the axes are not x forward and y left, or they fit neither region of the benchmarks.
     """
     if not polylines:
         return STANDARD

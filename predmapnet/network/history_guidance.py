@@ -19,8 +19,7 @@ class HistoryMapGuidance(nn.Module):
         super().__init__()
         width = config.decoder.width
         self.threshold = config.history_map.threshold
-        bev_width = config.bev.widths[1] if config.bev.mask_stride == 2 else config.bev.widths[0]
-        self.input = nn.Linear(bev_width, width)
+        self.input = nn.Linear(config.bev.widths[config.mask_level], width)
         self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, width)
         self.class_code = nn.Embedding(config.decoder.classes, width)
         self.cross_attention = Attention(width, config.decoder.heads)

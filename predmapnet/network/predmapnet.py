@@ -245,7 +245,7 @@ class PredMapNet(nn.Module):
         if self.config.history_map.memory:
             history = self.history_memory.align(history, relative_motion(ego_to_global, state.ego_to_global))
         if self.history_guidance is not None:
-            level = levels[1] if self.config.bev.mask_stride == 2 else levels[0]
+            level = levels[self.config.mask_level]
             tracks.queries = self.history_guidance(tracks.queries, state.instances.labels, history, level)
         return tracks, history
 

@@ -85,10 +85,7 @@ def all_truths(
 def cached_truths(folder: Path, key: str, compute: Callable[[], Sequence[FrameTruth]]) -> list[FrameTruth]:
     """Read a scene's ground truth by its :func:`cache_key`, or compute and keep that of all frames in order.
 
-    A damaged file is computed and written anew.
-
-    Raises:
-        UserError: the folder cannot be written to.
+    A damaged file is computed and written anew; a folder that cannot be written to raises UserError.
     """
     path = folder / f"truth-{key}.npz"
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):

@@ -36,8 +36,6 @@ from predmapnet.datasets.poses import quaternion_of
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
 
-Records = list[dict[str, Any]]
-
 
 class NuScenesGroundTruth:
     """One map of nuScenes: the ground truth around any pose.

@@ -12,12 +12,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
 from mapfusion.arrays import Float
-
-Geometries = NDArray[Any]
 
 BORDER = 0.2
 """Boundaries end this far inside the region, metres: it removes the artificial edges along the cut."""

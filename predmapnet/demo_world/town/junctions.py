@@ -37,6 +37,11 @@ class ArmReach:
     stop: float = 0.0
     paint: float = 0.0
 
+    @property
+    def clear(self) -> float:
+        """Where the kerbs of both sides have left the corners."""
+        return max(self.left_clear, self.right_clear)
+
 
 @dataclass
 class Corner:

@@ -80,9 +80,9 @@ def _lines_between_strips(section: CrossSection, stations: Float, stops: tuple[f
             kind = _kind(section, strips[upper], strips[lower], station, stops, habits)
             if kind is None:
                 continue
-            kinds, offsets = runs.setdefault(
-                _key(section, upper, lower), ([None] * len(stations), np.zeros(len(stations)))
-            )
+            # Lines keep their name along the street: the lane on the outer side of them, or the middle's left edge.
+            name = upper if upper < len(section.left) else 100 + lower
+            kinds, offsets = runs.setdefault(name, ([None] * len(stations), np.zeros(len(stations))))
             kinds[column], offsets[column] = kind, (edges[upper + 1, column] + edges[lower, column]) / 2
     return runs
 
@@ -96,11 +96,6 @@ def _edge_lines(section: CrossSection, stations: Float, habits: Habits) -> _Runs
             colour = habits.centre_colour if section.one_way and row == 0 else "white"
             runs[key] = [_Line(False, LineStyle.SOLID, colour, False)] * len(stations), edges[row] + sign * 0.35
     return runs
-
-
-def _key(section: CrossSection, upper: int, lower: int) -> int:
-    """Lines keep their name along the street: by the lane on the outer side of them, or the middle's left edge."""
-    return upper if upper < len(section.left) else 100 + lower
 
 
 def _stretches(kinds: list[_Line | None]) -> list[tuple[int, int]]:

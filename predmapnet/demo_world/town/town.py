@@ -95,7 +95,7 @@ def _cross_junction(
         room = abs(arm.far - arm.station)
         if len(junction.reaches) == 1 or (junction.is_minor and not is_alley):
             continue
-        reach.stop = max(reach.left_clear, reach.right_clear) + float(random.uniform(-1.0, 1.5))
+        reach.stop = reach.clear + float(random.uniform(-1.0, 1.5))
         crossing = crossings.get(index)
         if crossing is not None:
             works.crossings.append(crossing)

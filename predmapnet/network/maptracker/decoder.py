@@ -45,13 +45,17 @@ class LineCrossAttention(DeformableAttention):
         return rows + self.dropout(self.output(attended.view(batch, count, width)))
 
 
-class MemoryAttention(nn.Module):
-    """Attention of each track to its own recalled queries."""
+class _RowAttention(nn.Module):
+    """Base of the attentions whose queries are rows."""
 
     def __init__(self, config: MapTrackerDecoderConfig) -> None:
         super().__init__()
-        self.attention = _multihead(config)
+        self.attention = nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)
         self.dropout = nn.Dropout(config.dropout)
+
+
+class MemoryAttention(_RowAttention):
+    """Attention of each track to its own recalled queries."""
 
     def forward(self, tracks: Tensor, memory: RecalledQueries) -> Tensor:
         """Map tracks ``(B, T, C)`` to ``(B, T, C)``, the input included."""
@@ -63,13 +67,8 @@ class MemoryAttention(nn.Module):
         return tracks + self.dropout(attended.view_as(tracks))
 
 
-class RowSelfAttention(nn.Module):
+class RowSelfAttention(_RowAttention):
     """Attention of all rows to each other."""
-
-    def __init__(self, config: MapTrackerDecoderConfig) -> None:
-        super().__init__()
-        self.attention = _multihead(config)
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, rows: Tensor, valid: Tensor) -> Tensor:
         """Map rows ``(B, R, C)`` to ``(B, R, C)``, the input included; rows that are not valid are not looked at."""
@@ -173,7 +172,3 @@ def position_code(channels: int, grid: tuple[int, int], device: torch.device) ->
     row = along(rows)[:, :, None].expand(-1, -1, columns)
     column = along(columns)[:, None].expand(-1, rows, -1)
     return torch.cat([row, column])
-
-
-def _multihead(config: MapTrackerDecoderConfig) -> nn.MultiheadAttention:
-    return nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)

@@ -47,11 +47,6 @@ def bev_levels(config: PredMapNetConfig, batch: int = 1, seed: int = 0) -> list[
     return [torch.randn(batch, w, *s, generator=generator) for w, s in zip(config.bev.widths, sizes, strict=True)]
 
 
-def mask_level(config: PredMapNetConfig) -> int:
-    """Return which of the BEV levels has the grid of the masks."""
-    return 1 if config.bev.mask_stride == 2 else 0
-
-
 def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Tensor:
     """Return an ego pose ``(1, 4, 4)`` far from the origin of the map."""
     matrix = torch.eye(4, dtype=torch.float64)[None]
