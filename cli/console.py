@@ -34,9 +34,8 @@ def print_json(content: object) -> None:
     """Print JSON on stdout, for other programs; what JSON does not know (paths) becomes text."""
     import orjson
 
-    sys.stdout.write(
-        orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_NON_STR_KEYS, default=str).decode() + "\n"
-    )
+    options = orjson.OPT_INDENT_2 | orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
+    sys.stdout.write(orjson.dumps(content, option=options, default=str).decode() + "\n")
 
 
 def counted(count: int, noun: str) -> str:

@@ -47,6 +47,12 @@ def integrate(
         bool, typer.Option("--normalised", help="The results' points are shares (0 to 1) of the region's sides.")
     ] = False,
     crs: Crs = None,
+    correct: Annotated[
+        bool,
+        typer.Option(
+            "--correct-poses", help="The poses of single frames are off by a metre or so: align frames with each other."
+        ),
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -67,7 +73,7 @@ def integrate(
     region = _region(roi)
     if location is not None or origin is not None:
         _georeference(location, origin)  # a wrong option is reported before the work begins
-    done = integrate_file(frames, poses, region, min_score, y_forward, normalised)
+    done = integrate_file(frames, poses, region, min_score, y_forward, normalised, correct)
     synthetic = bool(done.provenance.get("synthetic")) and location is None
     named = str(done.provenance.get("location", ""))
     georeference = _georeference(location or (None if origin else named), origin, synthetic)

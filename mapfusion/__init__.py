@@ -5,6 +5,7 @@
   changed between two.
 - :func:`write_map` and :func:`read_map` know GeoJSON, GeoPackage, FlatGeobuf, Lanelet2, OpenDRIVE, nuScenes and
   Argoverse 2.
+- :func:`correct_poses` takes out what the poses of single frames are off.
 - :func:`visible_ground` says what ground cameras see, :func:`seen_along` what ground a drive looked at.
 """
 
@@ -16,6 +17,7 @@ from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.merge import merge_files, merge_maps
+from mapfusion.pose_correction import PoseErrors, correct_poses
 
 __all__ = [
     "CameraSector",
@@ -27,7 +29,9 @@ __all__ = [
     "MapElement",
     "MapIntegrator",
     "MergeConfig",
+    "PoseErrors",
     "RegionOfInterest",
+    "correct_poses",
     "diff_maps",
     "merge_files",
     "merge_maps",

@@ -2,8 +2,9 @@
 
 Drives over towns of the demo world and the Argoverse 2 logs below ``$PREDMAPNET_REFERENCE``, detections simulated. The
 poses are off by 0.75 m sideways, 1.5 m along and 0.85 degrees (standard deviations), as in RTMap (arXiv 2507.00980):
-every frame by itself, as RTMap's data have it, or the drive as a whole. Printed are precision, recall and F1 of the
-merged map at 1.0 m, and what remains of the errors of the poses, for 1, 2, 3, 5 and 10 drives.
+every frame by itself, as RTMap's data have it (with and without ``mapfusion.correct_poses``), or the drive as a whole.
+Printed are precision, recall and F1 of the merged map at 1.0 m, and what remains of the errors of the poses, for 1, 2,
+3, 5 and 10 drives.
 
 No drive tells where all of them together lie. So the last columns are those of the map, and of the poses, once the
 motion that all drives have in common, known here from their true poses, is taken out.
@@ -20,19 +21,26 @@ import numpy as np
 import orjson
 import shapely
 
-from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest, merge_maps
+from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest, correct_poses, merge_maps
 from mapfusion.arrays import Float
-from mapfusion.geometry import inverse_pose, transform_points
+from mapfusion.geometry import transform_points
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.demo_world.catalogue import trajectory, vector_map
 from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
 from predmapnet.files import check_output, write_file
 from tests.mapfusion.argoverse import LOGS, log_map, log_poses
+from tests.mapfusion.pose_noise import off_by_drive, off_by_frame, remaining_errors
 from tests.mapfusion.simulation import ROI, pose, simulate
 
-SIDEWAYS, ALONG, TURN = 0.75, 1.5, np.radians(0.85)
-"""Standard deviations of the errors of poses: metres, metres, radians."""
+Noise = Callable[[Sequence[Float], np.random.Generator], list[Float]]
+CONDITIONS: dict[str, tuple[Noise | None, bool]] = {
+    "right": (None, False),
+    "each frame off": (off_by_frame, False),
+    "  corrected": (off_by_frame, True),
+    "each drive off": (off_by_drive, False),
+}
+"""What is wrong with the poses, and whether the frames of each drive are corrected before they are mapped."""
 DRIVES = (1, 2, 3, 5, 10)
 DEVELOPMENT, HELD_OUT = (0, 1), (200, 201)
 """Seeds: the merge was made with the first, nobody has looked at the others while choosing."""
@@ -97,24 +105,6 @@ def _flat(at: Float) -> Float:
     return pose(at[0, 3], at[1, 3], float(np.arctan2(at[1, 0], at[0, 0])))
 
 
-def off_by_frame(poses: Sequence[Float], rng: np.random.Generator) -> list[Float]:
-    """Return poses that are each off by themselves."""
-    return [at @ pose(*(rng.normal(size=3) * (ALONG, SIDEWAYS, TURN))) for at in poses]
-
-
-def off_by_drive(poses: Sequence[Float], rng: np.random.Generator) -> list[Float]:
-    """Return poses that are off as a whole: shifted along and across the mean direction, turned about their middle."""
-    positions = np.array([at[:2, 3] for at in poses])
-    way = np.mean([at[:2, 0] for at in poses], axis=0)
-    middle = pose(*positions.mean(axis=0), float(np.arctan2(way[1], way[0])))
-    motion = middle @ pose(*(rng.normal(size=3) * (ALONG, SIDEWAYS, TURN))) @ inverse_pose(middle)
-    return [motion @ at for at in poses]
-
-
-Noise = Callable[[Sequence[Float], np.random.Generator], list[Float]]
-NOISES: dict[str, Noise] = {"frame": off_by_frame, "drive": off_by_drive}
-
-
 def detections(place: Place, seed: int, number: int) -> tuple[FrameMap, ...]:
     """Drive along a place, a little beside and ahead of the first drive, with other errors of the detector."""
     rng = np.random.default_rng([seed, number])
@@ -123,14 +113,16 @@ def detections(place: Place, seed: int, number: int) -> tuple[FrameMap, ...]:
     return simulate(place.truth, [at @ beside for at in place.poses], rng).frames
 
 
-def mapped(frames: Sequence[FrameMap], noise: Noise | None, rng: np.random.Generator) -> MappedDrive:
-    """Map one drive by poses that are off."""
+def mapped(frames: Sequence[FrameMap], noise: Noise | None, rng: np.random.Generator, correct: bool) -> MappedDrive:
+    """Map one drive by poses that are off, or by what correction makes of them."""
     true = tuple(frame.ego_to_global for frame in frames)
-    poses = true if noise is None else tuple(noise(true, rng))
+    poses = true if noise is None else noise(true, rng)
+    placed = [replace(frame, ego_to_global=at) for frame, at in zip(frames, poses, strict=True)]
+    placed = correct_poses(placed) if correct else placed
     integrator = MapIntegrator()
-    for frame, at in zip(frames, poses, strict=True):
-        integrator.add(replace(frame, ego_to_global=at))
-    return MappedDrive(integrator.map(), poses, true)
+    for frame in placed:
+        integrator.add(frame)
+    return MappedDrive(integrator.map(), tuple(frame.ego_to_global for frame in placed), true)
 
 
 def merged(place: Place, drives: Sequence[MappedDrive]) -> Remains:
@@ -147,8 +139,8 @@ def merged(place: Place, drives: Sequence[MappedDrive]) -> Remains:
     straight = whole.moved(lambda points: transform_points(common, points))
     precision, recall, f1 = _quality(whole, place)
     return Remains(
-        precision, recall, f1, *_errors(own, true), _quality(straight, place)[2],
-        *_errors([common @ at for at in own], true),
+        precision, recall, f1, *remaining_errors(own, true), _quality(straight, place)[2],
+        *remaining_errors([common @ at for at in own], true),
     )  # fmt: skip
 
 
@@ -156,13 +148,6 @@ def _quality(found: GlobalMap, place: Place) -> tuple[float, float, float]:
     at = THRESHOLDS.index(1.0)
     whole = global_map_quality(found, place.truth, place.seen).overall
     return float(whole.precision[at]), float(whole.recall[at]), float(whole.f1[at])
-
-
-def _errors(own: Sequence[Float], true: Sequence[Float]) -> tuple[float, float, float]:
-    off = [inverse_pose(at) @ mine for mine, at in zip(own, true, strict=True)]
-    rows = [(d[1, 3], d[0, 3], np.degrees(np.arctan2(d[1, 0], d[0, 0]))) for d in off]
-    sideways, along, turn = np.sqrt(np.mean(np.square(rows), axis=0)).tolist()
-    return sideways, along, turn
 
 
 def _common_motion(own: Sequence[Float], true: Sequence[Float]) -> Float:
@@ -181,7 +166,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures of each place and seed")
     parser.add_argument("--development", action="store_true", help="towns and seeds with which the merge was made")
     parser.add_argument("--drives", type=int, nargs="+", default=DRIVES)
-    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=NOISES)
     options = parser.parse_args()
     if options.json is not None:
         check_output(options.json)
@@ -189,7 +173,7 @@ def main() -> None:
     places = [town(name) for name in TOWNS[seeds]]
     places += [log(path.parent) for path in sorted(LOGS.glob("*/city_SE3_egovehicle.feather"))]
     print(f"{', '.join(place.name for place in places)}; seeds {seeds}; map at 1.0 m; errors of poses that remain")
-    print(f"{'':8}{'drives':>7}{'P':>7}{'R':>7}{'F1':>7}{'sideways':>10}{'along':>8}{'turn':>7}", end="")
+    print(f"{'poses':16}{'drives':>7}{'P':>7}{'R':>7}{'F1':>7}{'sideways':>10}{'along':>8}{'turn':>7}", end="")
     print(f"{'  without the common motion:':28}{'F1':>7}{'sideways':>10}{'along':>8}{'turn':>7}")
     rows = []
     frames = {
@@ -198,17 +182,17 @@ def main() -> None:
         for seed in seeds
         for number in range(max(options.drives))
     }
-    for name in ("none", *options.noise):
+    for name, (noise, correct) in CONDITIONS.items():
         found: dict[int, list[Remains]] = {count: [] for count in options.drives}
         for place in places:
             for seed in seeds:
                 drives = [
-                    mapped(frames[place, seed, number], NOISES.get(name), np.random.default_rng([seed, number, 1]))
+                    mapped(frames[place, seed, number], noise, np.random.default_rng([seed, number, 1]), correct)
                     for number in range(max(options.drives))
                 ]
                 for count in options.drives:
                     found[count].append(merged(place, drives[:count]))
-                    row = {"noise": name, "place": place.name, "seed": seed, "drives": count}
+                    row = {"poses": name.strip(), "place": place.name, "seed": seed, "drives": count}
                     rows.append(row | asdict(found[count][-1]))
         for count in options.drives:
             _print_row(name, count, found[count])
@@ -217,9 +201,9 @@ def main() -> None:
             path.write_bytes(orjson.dumps(rows, option=orjson.OPT_INDENT_2))
 
 
-def _print_row(noise: str, drives: int, found: Sequence[Remains]) -> None:
+def _print_row(poses: str, drives: int, found: Sequence[Remains]) -> None:
     p, r, f1, *errors, common_f1, sideways, along, turn = np.mean([astuple(one) for one in found], axis=0)
-    print(f"{noise:8}{drives:7d}{p:7.3f}{r:7.3f}{f1:7.3f}", end="")
+    print(f"{poses:16}{drives:7d}{p:7.3f}{r:7.3f}{f1:7.3f}", end="")
     print("{:8.2f} m{:6.2f} m{:6.2f}°".format(*errors), end="")
     print(f"{'':28}{common_f1:7.3f}{sideways:8.2f} m{along:6.2f} m{turn:6.2f}°", flush=True)
 
