@@ -224,7 +224,7 @@ def _pyramid(
     light: Light,
     road: shapely.Geometry,
     dark: _Darkness,
-    quads: tuple[Float, Float],
+    painted: tuple[Float, Float],
     near: Float | None,
 ) -> Pyramid:
     material = np.full((sheet.rows, sheet.columns), _INDEX["grass"], dtype=np.uint8)
@@ -246,15 +246,10 @@ def _pyramid(
     fill_materials(material, local[0], local[1], sheet.texel, table, fractal, white, occlusion, shadow, base)
 
     paint = np.zeros((sheet.rows, sheet.columns, 3), dtype=np.uint8)
-    corners, attributes = quads
+    corners, attributes = painted
     attributes = attributes * [1.0, 1 - 0.35 * light.wetness, 1.0]
-    fill_paint(
-        sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2),
-        attributes,
-        sheet.texel,
-        fractal_tile(0.75, seed=9),
-        paint,
-    )
+    quads = sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2)
+    fill_paint(quads, attributes, sheet.texel, fractal_tile(0.75, seed=9), paint)
 
     sizes = [(sheet.rows >> level, sheet.columns >> level) for level in range(LEVELS + 1)]
     counts = np.array([rows * columns for rows, columns in sizes])

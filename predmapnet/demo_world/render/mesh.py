@@ -215,14 +215,8 @@ def _box() -> _Template:
     return _template([(face, Material.PLAIN, None) for face in faces])
 
 
-_MATERIALS = {
-    "plain": Material.PLAIN,
-    "facade": Material.FACADE,
-    "foliage": Material.FOLIAGE,
-    "bark": Material.BARK,
-    "lamp": Material.LAMP,
-    "sign": Material.SIGN,
-}
+_TEXTURES = ("plain", "facade", "foliage", "bark", "lamp", "sign")
+"""Textures of solids that are called like their material."""
 
 
 def _select(solids: Solids, row: int) -> _Template:
@@ -267,8 +261,8 @@ def build_mesh(solids: Solids, rows: Integer) -> Mesh:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     plain = (materials == Material.PLAIN) & (tints[:, 0] < 0)
     own = np.full(len(solids.texture), int(Material.PLAIN), dtype=np.int64)
-    for texture, material in _MATERIALS.items():
-        own[solids.texture == texture] = material
+    for texture in _TEXTURES:
+        own[solids.texture == texture] = Material[texture.upper()]
     materials[plain] = own[owners[plain]]
     materials[(materials == Material.FACADE) & (normals[:, 2] > 0.5)] = Material.ROOF
     colours = np.where(tints < 0, solids.colour[owners], tints)

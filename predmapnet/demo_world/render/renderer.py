@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -130,17 +130,7 @@ class Renderer:
         present = np.ones(len(centre), dtype=bool)
         if solids.lifetime is not None:
             present = (solids.lifetime[:, 0] <= seconds) & (seconds < solids.lifetime[:, 1])
-        placed = Solids(
-            solids.shape,
-            centre,
-            solids.size,
-            solids.yaw,
-            solids.colour,
-            solids.texture,
-            solids.velocity,
-            solids.lifetime,
-        )
-        return placed, np.flatnonzero(present)
+        return replace(solids, centre=centre), np.flatnonzero(present)
 
     def mesh_at(self, frame_index: int) -> tuple[Mesh, Solids, NDArray[np.int64]]:
         """Return the mesh of a key frame, the solids in place, and the rows of those that move."""
@@ -183,18 +173,9 @@ class Renderer:
     def view(self, camera: Camera, frame_index: int) -> View:
         """Return a camera at a key frame as plain numbers."""
         pose = self.world.trajectory.ego_to_global[frame_index] @ camera.camera_to_ego
-        k = camera.intrinsics
         rotation, position = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
-        return View(
-            rotation,
-            position,
-            float(k[0, 0]),
-            float(k[1, 1]),
-            float(k[0, 2]),
-            float(k[1, 2]),
-            camera.width,
-            camera.height,
-        )
+        fx, fy, cx, cy = (float(camera.intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return View(rotation, position, fx, fy, cx, cy, camera.width, camera.height)
 
     def rasterise(self, mesh: Mesh, view: View, samples: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return the z-buffer of the solids: ``1 / depth`` and ids, ``(samples * height, samples * width)``."""
