@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapfusion.executors import Executor, Sequential
+if TYPE_CHECKING:
+    from mapfusion.executors import Executor
 
 
 class WorkerKind(StrEnum):
@@ -59,6 +60,7 @@ def open_executor(
         UserError: Ray is not installed, or its cluster is not there.
     """
     from cli.console import say_warning
+    from mapfusion.executors import Sequential
     from predmapnet.machine import workers_that_fit
     from predmapnet.runs.process_executor import ProcessExecutor
 
