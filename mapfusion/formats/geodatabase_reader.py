@@ -123,15 +123,17 @@ def _with_drawn_ground(plain: Path, path: Path, origin: Any, notes: ReadingNotes
     shapes = [shape for shape in shapely.from_wkb(raw.read(plain, layer=OBSERVED)[2]) if shape is not None]
     to_degrees = ToDegrees(system, f"{path}, layer {OBSERVED}") if shapes else _WGS84
     drawn = shapely.union_all([shapely.make_valid(shapely.transform(s, to_degrees.positions)) for s in shapes])
-    told = origin if isinstance(origin, dict) else {}
+    if not isinstance(origin, dict):
+        notes.add("its provenance is lost; the observed ground is that of its layer")
+        return {"observed": [ring.tolist() for ring in rings_around(drawn)]}
     try:
-        stored = ground_within([np.array(ring, dtype=np.float64) for ring in told.get("observed") or ()])
+        stored = ground_within([np.array(ring, dtype=np.float64) for ring in origin.get("observed") or ()])
     except (TypeError, ValueError):
         return origin
     if shapely.symmetric_difference(stored, drawn).area <= CHANGED_GROUND:
         return origin
     notes.add("the observed ground is that of its layer, which was changed by hand")
-    return {**told, "observed": [ring.tolist() for ring in rings_around(drawn)]}
+    return {**origin, "observed": [ring.tolist() for ring in rings_around(drawn)]}
 
 
 @contextmanager

@@ -53,7 +53,7 @@ def write_opendrive(
     to_metres = Transformer.from_crs("EPSG:4326", projection, always_xy=True)
     numbers = StableNumbers()
     roads: list[str] = []
-    corners = [np.zeros((1, 2))]
+    corners: list[Float] = []
     for element in all_named(global_map):
         element = element.counter_clockwise()
         feature = feature_of(element, georeference)
@@ -64,7 +64,9 @@ def write_opendrive(
         corners.append(points)
         write = _crossing if element.kind.is_ring else _line
         roads.append(write(element, points, heights, numbers.of(element.name), _user_data(feature)))
-    low, high = (function(np.concatenate(corners), axis=0).tolist() for function in (np.min, np.max))
+    low, high = (
+        function(np.concatenate(corners or [np.zeros((1, 2))]), axis=0).tolist() for function in (np.min, np.max)
+    )
     with write_sealed(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write('<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>\n')
         file.write(
