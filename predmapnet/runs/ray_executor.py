@@ -70,7 +70,9 @@ def _connected(address: str | None) -> ModuleType:
     try:
         _check_reachable(address)
         ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, include_dashboard=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # Ray raises all kinds; a machine without a cluster or without time for one is no bug
+        if address is None:
+            raise UserError(f"no Ray cluster could be started here: {error}") from error
         raise UserError(
             f"there is no Ray cluster at {address}: {error}. 'ray start --head' begins one, "
             "'ray start --address=HOST:6379' joins it"

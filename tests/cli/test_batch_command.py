@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from predmapnet.runs.output_folder import OutputFolder
 from tests.cli.tiny_nuscenes import image_path, write_tiny_nuscenes
 
 SCENES = ("scene-0001", "scene-0002", "scene-0003", "scene-0004")
@@ -131,3 +132,16 @@ def test_wrong_scenes_and_folders_are_told_before_the_work(predmapnet, data, ran
     assert "cannot make the folder" in blocked.err
     empty = predmapnet("batch", "--split", "train", "--out", "maps", *settings(data, random_weights))
     assert empty.code == 2
+
+
+def test_maps_go_to_an_object_store_and_what_is_there_is_not_made_again(predmapnet, data, random_weights, bucket):
+    out = f"{bucket}/maps"
+    arguments = ["batch", "scene-0001", "--out", out, "--jobs", "1", *settings(data, random_weights)]
+    assert predmapnet(*arguments).code == 0
+    folder = OutputFolder(out)
+    assert folder.names() == {"scene-0001.geojson", "scene-0001.summary.json", "summary.json", "report.html"}
+    again = predmapnet(*arguments)
+    assert again.code == 0
+    assert "1 of them done before" in again.err
+    page = dict(folder.read(["report.html"]))["report.html"].decode()
+    assert 'href="scene-0001.geojson"' in page
