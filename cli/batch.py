@@ -11,6 +11,7 @@ import typer
 from cli.options import (
     AllowMissingCameras,
     Compile,
+    Crs,
     DataRoot,
     Dataset,
     Device,
@@ -75,12 +76,17 @@ def batch(
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
     allow_missing_cameras: AllowMissingCameras = False,
+    map_format: Annotated[
+        str,
+        typer.Option("--format", help="Maps as geojson, gpkg, fgb, xodr, nuscenes.json or argoverse2.json."),
+    ] = "geojson",
+    crs: Crs = None,
     force: Force = False,
 ) -> None:
     """Map many scenes in several processes or on a cluster; run it again to resume.
 
-    Writes NAME.geojson and NAME.summary.json of each scene, or NAME.failed.json, and for the folder summary.json and
-    report.html, the page to look at first. The exit code is 1 if any scene failed.
+    Writes NAME.geojson (or another --format) and NAME.summary.json of each scene, or NAME.failed.json, and for the
+    folder summary.json and report.html, the page to look at first. The exit code is 1 if any scene failed.
     """
     from cli.batch_display import BatchDisplay
     from cli.console import progress_display
@@ -103,6 +109,8 @@ def batch(
         None if origin is None else given_origin(origin),
         rate,
         force,
+        _map_suffix(map_format, crs),
+        crs,
         weights_hash(weights),
     )
     chosen, settings = _chosen(list(scenes or []), split, settings, split_scheme.value)
@@ -124,6 +132,21 @@ def batch(
     shown.close(folder.link("summary.json"), folder.link("report.html"))
     if shown.failed:
         raise typer.Exit(1)
+
+
+def _map_suffix(map_format: str, crs: str | None) -> str:
+    """Return the ending of maps by what the user calls their format, checked against the reference system."""
+    from mapfusion.formats.by_suffix import SUFFIXES, check_crs
+    from predmapnet.errors import UserError, value_errors_told
+
+    suffix = f".{map_format.lower().removeprefix('.')}"
+    endings = [ending.removeprefix(".") for ending in SUFFIXES if ending not in (".json", ".osm")]
+    if suffix.removeprefix(".") not in endings:
+        why = "; Autoware wants each .osm in a folder of its own" if suffix == ".osm" else ""
+        raise UserError(f"--format {map_format}: one of {', '.join(endings)} is expected{why}")
+    with value_errors_told():
+        check_crs(Path(f"map{suffix}"), crs)
+    return suffix
 
 
 def _chosen(

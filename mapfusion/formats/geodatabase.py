@@ -76,7 +76,7 @@ def write_geodatabase(
                 _write_observed(plain, origin["observed"], system)
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise OSError(f"cannot write {path}: {error}") from error
-        _write_styles(plain, origin["created"])
+        _write_styles(plain, origin["created"].replace("Z", ".000Z"))
 
 
 def _write_layer(
@@ -106,6 +106,7 @@ def _write_layer(
         crs=system.name,
         gdal_tz_offsets={name: np.full(len(rows), UTC_OFFSET, dtype=np.int32) for name in TIMES},
         layer_metadata={METADATA: json.dumps(dict(origin))},
+        **({} if driver == FLAT else {"DATETIME_PRECISION": "MILLISECOND"}),
     )
 
 

@@ -54,6 +54,8 @@ class BatchSettings:
         origin: of the logs' frame, if the user says it.
         rate: frames a second of logs of one's own; None takes the usual one.
         force: replace maps that were changed by hand since they were written.
+        map_suffix: ending of the maps, which is their format.
+        crs: reference system of the maps, an EPSG code; None for the one of the format.
         weights_sha256: of the weights, which must be the same wherever a worker reads them.
         version: of PredMapNet, which must be the same on all machines.
     """
@@ -68,6 +70,8 @@ class BatchSettings:
     origin: LocalPlane | None = None
     rate: float | None = None
     force: bool = False
+    map_suffix: str = ".geojson"
+    crs: str | None = None
     weights_sha256: str = ""
     version: str = predmapnet.__version__
 
@@ -75,10 +79,11 @@ class BatchSettings:
         """Name the files of one scene."""
         name = file_name(scene)
         return Outputs(
-            map=folder / f"{name}.geojson",
+            map=folder / f"{name}{self.map_suffix}",
             recording=folder / f"{name}.rrd" if self.recordings else None,
             frames=folder / f"{name}.parquet" if self.frames else None,
             force=self.force,
+            crs=self.crs,
         )
 
     def fingerprint(self, scene: ListedScene) -> str:
@@ -94,6 +99,7 @@ class BatchSettings:
             None if self.origin is None else [self.origin.longitude, self.origin.latitude],
             self.threads,
             self.rate,
+            self.crs,
         ]
         return hashlib.sha256(orjson.dumps(deciding)).hexdigest()[:16]
 

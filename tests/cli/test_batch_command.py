@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from predmapnet.runs.batch import BatchSettings
 from predmapnet.runs.output_folder import OutputFolder
+from predmapnet.runs.scene_choice import ListedScene
 from tests.cli.tiny_nuscenes import image_path, write_tiny_nuscenes
 
 SCENES = ("scene-0001", "scene-0002", "scene-0003", "scene-0004")
@@ -132,6 +134,19 @@ def test_wrong_scenes_and_folders_are_told_before_the_work(predmapnet, data, ran
     assert "cannot make the folder" in blocked.err
     empty = predmapnet("batch", "--split", "train", "--out", "maps", *settings(data, random_weights))
     assert empty.code == 2
+    degrees = predmapnet("batch", "--out", "maps", "--crs", "EPSG:32632", *settings(data, random_weights))
+    assert degrees.code == 2
+    assert "RFC 7946" in degrees.err
+    for name in ("osm", "shp"):
+        assert predmapnet("batch", "--out", "maps", "--format", name, *settings(data, random_weights)).code == 2
+
+
+def test_maps_of_another_format_are_made_again():
+    plain, projected = BatchSettings("demo", None), BatchSettings("demo", None, map_suffix=".gpkg", crs="EPSG:32632")
+    outputs = projected.outputs("scene-0001", Path("maps"))
+    assert (outputs.map, outputs.crs) == (Path("maps/scene-0001.gpkg"), "EPSG:32632")
+    scene = ListedScene("scene-0001", None)
+    assert plain.fingerprint(scene) != projected.fingerprint(scene)
 
 
 def test_maps_go_to_an_object_store_and_what_is_there_is_not_made_again(predmapnet, data, random_weights, bucket):

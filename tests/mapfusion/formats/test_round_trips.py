@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,6 +15,7 @@ from mapfusion.formats.by_suffix import SUFFIXES, read_maps, write_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.merge import merge_files
+from tests.environments import printed_json
 from tests.mapfusion.formats.map_editors import ADDED, EDITORS
 
 PLANE = LocalPlane(8.4, 49.0, "harbour")
@@ -79,3 +84,31 @@ def test_edits_come_back_into_diff_and_merge(tmp_path, suffix):
     np.testing.assert_allclose(
         kept.heights, 100.0 + (plane.to_wgs84(kept.points)[:, 0] - 8.4) * PLANE.scale[0] / 50, atol=0.1
     )
+
+
+@pytest.mark.devkit
+@pytest.mark.parametrize("suffix", [".gpkg", ".geojson"])
+def test_qgis_shows_our_styles_and_its_edits_come_back(tmp_path, suffix):
+    python = Path("/usr/bin/python3")
+    if (
+        not python.is_file()
+        or subprocess.run([python, "-c", "import qgis.core"], capture_output=True, check=False).returncode
+    ):
+        pytest.skip("QGIS's library is not installed (Debian: apt-get install python3-qgis)")
+    before, after = tmp_path / f"before{suffix}", tmp_path / f"after{suffix}"
+    for path in (before, after):
+        write_map(EXAMPLE, path, PLANE)
+    added = json.dumps(PLANE.to_wgs84(ADDED).tolist())
+    seen = printed_json(python, Path(__file__).with_name("open_with_qgis.py"), after, after, added)
+    assert (seen["features"], seen["crs"]) == (3, "EPSG:4326")
+    assert seen["heights"][0] == pytest.approx(100.0)
+    if suffix == ".gpkg":
+        assert seen["categories"] == ["divider", "boundary"]
+        assert seen["types"]["first_seen"] == "DateTime"
+    (old, new), plane = read_maps([before, after])
+    assert any("drawn by hand" in note for note in new.notes)
+    found = diff_maps(old, new, plane, DiffConfig(tolerance=0.5, align=False))
+    assert found.metres(Change.REMOVED, ElementKind.DIVIDER) == pytest.approx(60.0, abs=1.0)
+    assert found.metres(Change.ADDED, ElementKind.DIVIDER) == pytest.approx(60.0, abs=1.0)
+    assert found.metres(Change.REMOVED, ElementKind.BOUNDARY) + found.metres(Change.MOVED, ElementKind.BOUNDARY) > 20.0
+    assert {element.name for element in new} >= {"stays", "kerb", "crossing"}
