@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from predmapnet.runs.batch import Outcome
     from predmapnet.runs.infer import MappingPipeline, SceneReport
 
 out = Console(highlight=False, soft_wrap=True)
@@ -35,9 +34,8 @@ def print_json(content: object) -> None:
     """Print JSON on stdout, for other programs; what JSON does not know (paths) becomes text."""
     import orjson
 
-    sys.stdout.write(
-        orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_NON_STR_KEYS, default=str).decode() + "\n"
-    )
+    options = orjson.OPT_INDENT_2 | orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY
+    sys.stdout.write(orjson.dumps(content, option=options, default=str).decode() + "\n")
 
 
 def counted(count: int, noun: str) -> str:
@@ -70,6 +68,10 @@ class ProgressDisplay:
     def scenes(self, done: int, total: int) -> None:
         """Show the number of scenes finished."""
         self._show("scenes", done, total, "")
+
+    def line(self, text: str) -> None:
+        """Print a line, above the bars where there are some."""
+        err.print(text, markup=False)
 
     def _show(self, what: str, done: int, total: int, unit: str) -> None:
         now = monotonic()
@@ -142,7 +144,7 @@ def say_report(report: SceneReport, as_json: bool = False) -> None:
     if as_json:
         print_json(asdict(report))
     else:
-        out.print(elements_table(report.scene, report.elements, report.metres))
+        print_whole(elements_table(report.scene, report.elements, report.metres))
         for line in report_lines(report):
             out.print(line, markup=False)
     say_notes(report.notes, report.rejections)
@@ -156,29 +158,7 @@ def say_notes(notes: Iterable[str], rejections: Mapping[str, int]) -> None:
         say_warning(f"the integrator rejected {count} x {reason}")
 
 
-def say_outcomes(outcomes: Sequence[Outcome], folder: Path) -> None:
-    """Print one line per scene of a batch, and the reason of each failure."""
-    table = Table(show_edge=False, pad_edge=False, collapse_padding=True)
-    for heading in ("scene", ""):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("elements", "metres", "frames/s", "mAP", "precision", "recall"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for outcome in sorted(outcomes, key=lambda outcome: outcome.scene):
-        table.add_row(outcome.scene, outcome.status, *_figures(outcome))
-    out.print(table)
-    for outcome in outcomes:
-        if outcome.reason is not None:
-            say_error(f"{outcome.scene}: {outcome.reason}")
-    failed = sum(outcome.status == "failed" for outcome in outcomes)
-    out.print(
-        f"{len(outcomes) - failed} of {len(outcomes)} scenes are done; see {folder / 'summary.json'}", markup=False
-    )
-
-
-def _figures(outcome: Outcome) -> list[str]:
-    if outcome.report is None:
-        return []
-    report, accuracy = outcome.report, outcome.report["accuracy"]
-    measured = [f"{accuracy[name]:.3f}" for name in ("mean_ap", "precision", "recall")] if accuracy else []
-    elements, metres = sum(report["elements"].values()), sum(report["metres"].values())
-    return [str(elements), f"{metres:.0f}", f"{report['frames_per_second']:.1f}", *measured]
+def print_whole(table: Table) -> None:
+    """Print a table at its own width: a terminal that is too narrow breaks its lines, but no number is cut."""
+    width = Measurement.get(out, out.options.update(max_width=1000), table).maximum
+    out.print(table, width=max(width, out.width), crop=False)

@@ -168,7 +168,8 @@ def evaluate(
         write_figures(json_file, {**figures, "per_scene": per_scene}, context)
         out.print(f"written: {json_file}", markup=False)
     if report is not None:
-        write_report(report, total, context, per_scene, _origin(results, weights, total))
+        maps = {scene.frames[0].scene: scene.maps for scene in measured if scene.maps is not None}
+        write_report(report, total, context, per_scene, _origin(results, weights, total), maps)
         out.print(f"written: {report}", markup=False)
 
 

@@ -10,6 +10,7 @@ import typer
 from cli.options import (
     AllowMissingCameras,
     Compile,
+    Crs,
     DataRoot,
     Dataset,
     Device,
@@ -19,10 +20,10 @@ from cli.options import (
     Origin,
     PrecisionOption,
     Rate,
-    Threads,
+    SceneThreads,
     Weights,
 )
-from predmapnet.machine import EngineKind, NetworkOptions, Precision, use_threads
+from predmapnet.machine import THREADS_PER_SCENE, EngineKind, NetworkOptions, Precision, use_threads
 
 
 def infer(
@@ -33,7 +34,7 @@ def infer(
             help="Its name (`predmapnet scenes` lists them), or the folder of a log.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write; its ending is the format (README).")],
     recording: Annotated[Path | None, typer.Option(help="Rerun recording to write (.rrd).")] = None,
     save_frames: Annotated[Path | None, typer.Option(help="Per-frame results to write (.parquet).")] = None,
     dataset: Dataset = None,
@@ -45,8 +46,9 @@ def infer(
     precision: PrecisionOption = Precision.FLOAT32,
     compiled: Compile = False,
     engine: Engine = EngineKind.TORCH,
-    threads: Threads = 0,
+    threads: SceneThreads = THREADS_PER_SCENE,
     allow_missing_cameras: AllowMissingCameras = False,
+    crs: Crs = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -59,7 +61,7 @@ def infer(
     name: str | None = scene
     if (folder := folder_named(scene, dataset)) is not None:
         name, (dataset, data_root) = None, folder
-    outputs = Outputs(out, recording, save_frames, force)
+    outputs = Outputs(out, recording, save_frames, force, crs)
     outputs.check()
     frame_origin = None if origin is None else given_origin(origin)
     use_threads(threads)

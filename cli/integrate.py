@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cli.options import Force, Json
+from cli.options import Crs, Force, Json
 
 if TYPE_CHECKING:
     from mapfusion.elements import RegionOfInterest
@@ -22,7 +22,7 @@ def integrate(
             help="Per-frame results: .parquet (as of --save-frames), or .json of MapTracker, MapTR, HDMapNet and kin.",
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write: .geojson, .gpkg, .fgb or .osm.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Map to write; its ending is the format (README).")],
     poses: Annotated[
         Path | None, typer.Option(help="Poses by token (.json or .csv), for .json results.", show_default=False)
     ] = None,
@@ -46,6 +46,13 @@ def integrate(
     normalised: Annotated[
         bool, typer.Option("--normalised", help="The results' points are shares (0 to 1) of the region's sides.")
     ] = False,
+    crs: Crs = None,
+    correct: Annotated[
+        bool,
+        typer.Option(
+            "--correct-poses", help="The poses of single frames are off by a metre or so: align frames with each other."
+        ),
+    ] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -62,11 +69,11 @@ def integrate(
     from predmapnet.runs.integrate import integrate_file
     from predmapnet.runs.outputs import Outputs
 
-    Outputs(map=out, force=force).check([path for path in (frames, poses) if path is not None])
+    Outputs(map=out, force=force, crs=crs).check([path for path in (frames, poses) if path is not None])
     region = _region(roi)
     if location is not None or origin is not None:
         _georeference(location, origin)  # a wrong option is reported before the work begins
-    done = integrate_file(frames, poses, region, min_score, y_forward, normalised)
+    done = integrate_file(frames, poses, region, min_score, y_forward, normalised, correct)
     synthetic = bool(done.provenance.get("synthetic")) and location is None
     named = str(done.provenance.get("location", ""))
     georeference = _georeference(location or (None if origin else named), origin, synthetic)
@@ -79,7 +86,7 @@ def integrate(
     }
     provenance.pop(LOCAL_FRAME, None)  # its place is known now
     with value_errors_told():
-        write_map(done.map, out, georeference, provenance)
+        write_map(done.map, out, georeference, provenance, crs)
     elements = {kind.label: len(done.map.of_kind(kind)) for kind in ElementKind}
     metres = {kind.label: done.map.length(kind) for kind in ElementKind}
     if as_json:

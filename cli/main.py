@@ -22,6 +22,7 @@ from cli.infer import infer
 from cli.integrate import integrate
 from cli.merge import merge
 from cli.plain_help import PlainCommand
+from cli.report import report
 from cli.scenes import scenes
 from cli.train import train
 from cli.view import view
@@ -57,6 +58,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
     train,
     integrate,
     merge,
+    report,
     diff,
 )
 for command in COMMANDS:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cli.options import Force, Json
+from cli.options import Crs, Force, Json
+from cli.workers import Address, EngineOption, Jobs, WorkerKind, open_executor
 
 if TYPE_CHECKING:
     from mapfusion.merge.report import MergeReport
@@ -23,8 +24,11 @@ def merge(
     tile: Annotated[
         float, typer.Option(min=50.0, help="Side of a tile, metres; larger tiles need more memory.")
     ] = 200.0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes; they share the cores.")] = 1,
+    jobs: Jobs = None,
+    engine: EngineOption = WorkerKind.PROCESS,
+    address: Address = None,
     style: Annotated[bool, typer.Option("--style", help="Write styles for QGIS beside the map (.qml).")] = False,
+    crs: Crs = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -34,7 +38,7 @@ def merge(
     """
     from cli.console import counted, elements_table, print_json, progress_display, say_warning
     from cli.console import out as screen
-    from mapfusion.formats.by_suffix import check_suffix
+    from mapfusion.formats.by_suffix import check_crs, check_suffix
     from mapfusion.formats.qgis_style import write_styles
     from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
@@ -44,10 +48,17 @@ def merge(
 
     with value_errors_told():
         check_suffix(out)
+        check_crs(out, crs)
     paths = _files(maps, out)
     check_output(out, (), paths, force)
-    with value_errors_told(), progress_display() as display:
-        report = merge_files(paths, out, MergeConfig(tile=tile), jobs, display.preparing, {"version": __version__})
+    config, told = MergeConfig(tile=tile), {"version": __version__}
+    with (
+        value_errors_told(),
+        progress_display() as display,
+        open_executor(engine, address, jobs, apart=False) as (executor, _),
+    ):
+        whole = [path.absolute() for path in paths]
+        report = merge_files(whole, out, config, executor, display.preparing, told, crs)
     written = [out, *(write_styles(out) if style else ())]
     if as_json:
         print_json({**asdict(report), "written": written})
@@ -68,7 +79,7 @@ def merge(
 
 
 def _files(maps: list[Path], out: Path) -> list[Path]:
-    from mapfusion.formats.by_suffix import SUFFIXES
+    from mapfusion.formats.by_suffix import SUFFIXES, map_suffix
     from predmapnet.errors import UserError
 
     paths: list[Path] = []
@@ -76,11 +87,12 @@ def _files(maps: list[Path], out: Path) -> list[Path]:
         if not path.is_dir():
             paths.append(path)
             continue
-        endings = set(SUFFIXES) - {".json"}  # summaries and other things are JSON, too
         inside = [
             file
             for file in sorted(path.rglob("*"))
-            if file.suffix.lower() in endings and not file.name.startswith(".") and file.absolute() != out.absolute()
+            if map_suffix(file) not in (None, ".json")  # summaries and other things are JSON, too
+            and not file.name.startswith(".")
+            and file.absolute() != out.absolute()
         ]
         if not inside:
             raise UserError(f"there is no map in the folder {path}; maps end in {', '.join(SUFFIXES)}")

@@ -68,6 +68,14 @@ Compile = Annotated[
     ),
 ]
 Threads = Annotated[int, typer.Option(min=0, help="CPU threads; 0 for all cores.")]
+SceneThreads = Annotated[
+    int,
+    typer.Option(
+        "--threads",
+        min=1,
+        help="CPU threads of a scene. The last digits of a map depend on them, but not on anything else.",
+    ),
+]
 Origin = Annotated[
     str | None,
     typer.Option(
@@ -75,6 +83,10 @@ Origin = Annotated[
         "Default: the data set's, or a local frame.",
         show_default=False,
     ),
+]
+Crs = Annotated[
+    str | None,
+    typer.Option(help="Reference system of a .gpkg or .fgb, as in EPSG:32632. Default: WGS84.", show_default=False),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, for other programs.")]
 Force = Annotated[

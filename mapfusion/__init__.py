@@ -3,7 +3,9 @@
 - :class:`MapIntegrator` fuses the :class:`FrameMap` of single frames into a :class:`GlobalMap`.
 - :func:`merge_maps` and :func:`merge_files` make one map of the maps of many drives; :func:`diff_maps` says what
   changed between two.
-- :func:`write_map` and :func:`read_map` know GeoJSON, GeoPackage, FlatGeobuf and Lanelet2.
+- :func:`write_map` and :func:`read_map` know GeoJSON, GeoPackage, FlatGeobuf, Lanelet2, OpenDRIVE, nuScenes and
+  Argoverse 2.
+- :func:`correct_poses` takes out what the poses of single frames are off.
 - :func:`visible_ground` says what ground cameras see, :func:`seen_along` what ground a drive looked at.
 """
 
@@ -15,6 +17,7 @@ from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.merge import merge_files, merge_maps
+from mapfusion.pose_correction import PoseErrors, correct_poses
 
 __all__ = [
     "CameraSector",
@@ -26,7 +29,9 @@ __all__ = [
     "MapElement",
     "MapIntegrator",
     "MergeConfig",
+    "PoseErrors",
     "RegionOfInterest",
+    "correct_poses",
     "diff_maps",
     "merge_files",
     "merge_maps",

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from mapfusion.arrays import Bool, Float, Integer, Rows
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.stretches import Samples, sample_lines
 
-TURNS = (0.0, 0.6, -0.6, 1.2, -1.2)
-"""Turns from which the search starts, degrees; all but the first only if that one finds no good agreement."""
+TURNS = np.radians([0.0, 0.6, -0.6, 1.2, -1.2])
+"""Turns that are tried around each of :data:`BASES`, radians."""
+
+BASES = np.radians([0.0, 2.4, -2.4])
+"""Turns around which is searched, radians; all but the first only if that one finds no good agreement."""
 
 SEARCH_SAMPLES = 150
-"""Number of samples that take part in the search on the grid."""
+"""Number of samples that vote for a shift."""
+
+VOTE_CELL, VOTE_BLUR = 0.5, 0.6
+"""Side of a cell of shifts and the standard deviation of a vote, metres."""
+
+COMMON = 8.0
+"""Samples with a line of their kind this close lie in common ground, metres."""
 
 RIVAL_DISTANCE = 2.0
-"""Shifts this far from the best one are another answer, metres."""
+"""Shifts this far from the best one, and up to twice as far, are another answer, metres."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +51,13 @@ class AlignmentConfig:
     """
 
     spacing: float = 1.0
-    reach: float = 4.0
+    reach: float = 7.0
     close: float = 0.75
     min_overlap: float = 40.0
     min_agreement: float = 0.6
     min_hold: float = 10.0
     max_residual: float = 0.5
-    max_turn: float = 2.0
+    max_turn: float = 4.0
     rival_ratio: float = 0.9
     correlation: float = 10.0
 
@@ -70,9 +80,9 @@ class Alignment:
     centre: Float
     shift: Float
     turn: float
-    information: Float
-    overlap: float
-    residual: float
+    information: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    overlap: float = 0.0
+    residual: float = 0.0
     refusal: str = ""
     disagrees: bool = False
 
@@ -116,66 +126,94 @@ def landmarks(global_map: GlobalMap, config: AlignmentConfig | None = None) -> L
 
 
 def align(source: Landmarks, target: Landmarks, config: AlignmentConfig | None = None) -> Alignment:
-    """Find the rigid motion that puts ``source`` on ``target``, and whether to believe it.
+    """Find the rigid motion that puts ``source`` on ``target`` (both of :func:`landmarks`), and whether to believe it.
 
-    The shift is first looked for on a grid of one metre, by how many samples come to lie near a line of their kind
-    (from several turns, if need be); then refined by Gauss-Newton on distances across lines, the worst fifth left out.
-
-    Args:
-        source, target: from :func:`landmarks`.
-        config: what it takes to be certain.
+    Pairs of samples of one kind vote for the shift between them (from several turns, if need be); the best shift is
+    refined by Gauss-Newton on distances across lines, the worst fifth left out.
     """
     config = config or AlignmentConfig()
-    near, _, _ = _nearest(source, target, source.samples.points, config.reach + 4.0)
-    common = np.flatnonzero(near >= 0)
+    everything = np.arange(len(source.samples))
+    common = everything[_nearest(source, target, everything, source.samples.points, COMMON)[0] >= 0]
     overlap = float(source.samples.spacing[common].sum())
     if overlap < config.min_overlap:
-        return _refused(f"only {overlap:.0f} m of lines in common ground", overlap)
-    points = source.samples.points[common]
-    centre = points.mean(axis=0)
+        refusal = f"only {overlap:.0f} m of lines in common ground"
+        return Alignment(np.zeros(2), np.zeros(2), 0.0, overlap=overlap, refusal=refusal)
+    centre = source.samples.points[common].mean(axis=0)
     best: Alignment | None = None
-    for start_turn in TURNS:
-        result = _refine(source, target, common, centre, np.radians(start_turn), config)
+    for base in BASES:
+        result = _refine(source, target, common, _search(source, target, common, centre, base, config), config)
         if best is None or result.overlap > best.overlap:
             best = result
         if best.overlap > 0.8 * overlap:
             break
     assert best is not None
-    rival = _score(source, target, common, best, _elsewhere(config)).max() / max(
-        float(_score(source, target, common, best, np.zeros((1, 2)))[0]), 1e-9
-    )
-    refusal, disagrees = _doubt(best, best.overlap / overlap, float(rival), config)
+    refusal, disagrees = _doubt(best, best.overlap / overlap, _rival(source, target, common, best), config)
     return replace(best, refusal=refusal, disagrees=disagrees)
 
 
-def _refine(
-    source: Landmarks, target: Landmarks, common: Rows, centre: Float, turn: float, config: AlignmentConfig
+def _search(
+    source: Landmarks, target: Landmarks, common: Rows, centre: Float, base: float, config: AlignmentConfig
 ) -> Alignment:
-    """Look for the shift on a grid, then refine shift and turn."""
-    zero = np.zeros(2)
-    grid = _grid(config)
-    found = _score(source, target, common, Alignment(centre, zero, turn, np.eye(3), 0.0, 0.0), grid)
-    shift = grid[int(np.argmax(found))]
+    """Return the motion, unrefined, that most samples vote for, among turns around ``base``."""
+    reach = round(config.reach / VOTE_CELL)
+    points, partners = _voters(source, target, common, Alignment(centre, np.zeros(2), base), config.reach + 2.0)
+    best, found = -1.0, Alignment(centre, np.zeros(2), base)
+    # of two shifts that fit as well the smaller one
+    apart = np.hypot(*np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"))
+    likely = np.exp(-0.125 * (apart / reach) ** 2)
+    for turn in base + TURNS:
+        votes = _vote(partners - move(points, centre, np.zeros(2), turn), reach) * likely
+        if votes.max() > best:
+            best = float(votes.max())
+            cell = np.array(np.unravel_index(np.argmax(votes), votes.shape), dtype=np.float64)
+            found = Alignment(centre, (cell - reach) * VOTE_CELL, float(turn))
+    return found
+
+
+def _rival(source: Landmarks, target: Landmarks, common: Rows, motion: Alignment) -> float:
+    """Return the votes for the best other place after a motion, as a share of those for staying."""
+    reach = round(2 * RIVAL_DISTANCE / VOTE_CELL)
+    points, partners = _voters(source, target, common, motion, 2 * RIVAL_DISTANCE + 1.0)
+    votes = _vote(partners - motion.apply(points), reach)
+    apart = np.hypot(*np.meshgrid(*[np.arange(-reach, reach + 1) * VOTE_CELL] * 2, indexing="ij"))
+    return float(votes[apart >= RIVAL_DISTANCE].max() / max(votes[reach, reach], 1e-9))
+
+
+def _voters(source: Landmarks, target: Landmarks, common: Rows, motion: Alignment, reach: float) -> tuple[Float, Float]:
+    """Return pairs of points of the source and the target, ``(n, 2)`` each, that one motion brings within reach."""
+    thin = common[:: max(1, len(common) // SEARCH_SAMPLES)]
+    moved = motion.apply(source.samples.points[thin])
+    own, others = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
+    for kind, (members, tree) in target.trees.items():
+        rows = np.flatnonzero(source.kinds[thin] == kind)
+        if len(rows):
+            near = cKDTree(moved[rows]).sparse_distance_matrix(tree, reach, output_type="ndarray")
+            own.append(thin[rows[near["i"]]])
+            others.append(members[near["j"]])
+    first, second = np.concatenate(own), np.concatenate(others)
+    alike = _alike(source.samples.tangents[first], target.samples.tangents[second])
+    return source.samples.points[first[alike]], target.samples.points[second[alike]]
+
+
+def _vote(offsets: Float, reach: int) -> Float:
+    """Count votes for shifts ``(n, 2)``, metres, on a grid of ``2 reach + 1`` cells a side, blurred."""
+    side = 2 * reach + 1
+    cells = np.rint(offsets / VOTE_CELL).astype(np.int64) + reach
+    cells = cells[((cells >= 0) & (cells < side)).all(axis=1)]
+    votes = np.bincount(cells[:, 0] * side + cells[:, 1], minlength=side * side).reshape(side, side)
+    return np.asarray(gaussian_filter(votes.astype(np.float64), VOTE_BLUR / VOTE_CELL, mode="constant"))
+
+
+def _refine(source: Landmarks, target: Landmarks, common: Rows, start: Alignment, config: AlignmentConfig) -> Alignment:
+    """Refine shift and turn."""
+    shift, turn = start.shift, start.turn
     for reach in (3.0, 2.0, 1.5, 1.0, config.close, config.close, config.close):
-        step, information, residual, agreed = _step(source, target, common, centre, shift, turn, reach, config)
+        step, information, residual, agreed = _step(source, target, common, start.centre, shift, turn, reach, config)
         shift, turn = shift + step[:2], turn + float(step[2])
         if reach == config.close and np.abs(step).max() < 1e-4:
             break
     shared = float(source.samples.spacing[common][agreed].sum())
-    return Alignment(centre, shift, turn, information, shared, residual)
-
-
-def _grid(config: AlignmentConfig) -> Float:
-    """Shifts a metre apart, ``(n, 2)``, the smallest first."""
-    side = np.arange(-config.reach, config.reach + 0.5)
-    shifts = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(shifts[np.argsort((shifts**2).sum(axis=1), kind="stable")])
-
-
-def _elsewhere(config: AlignmentConfig) -> Float:
-    """Shifts that are not the same place, ``(n, 2)``."""
-    grid = _grid(config)
-    return np.asarray(grid[np.linalg.norm(grid, axis=1) >= RIVAL_DISTANCE])
+    return Alignment(start.centre, shift, turn, information, shared, residual)
 
 
 def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentConfig) -> tuple[str, bool]:
@@ -198,48 +236,30 @@ def _doubt(result: Alignment, agreement: float, rival: float, config: AlignmentC
     return "", False
 
 
-def _refused(reason: str, overlap: float) -> Alignment:
-    return Alignment(np.zeros(2), np.zeros(2), 0.0, np.zeros((3, 3)), overlap, 0.0, reason)
+def _alike(first: Float, second: Float) -> Bool:
+    """Whether directions ``(n, 2)`` are the same, either way."""
+    return np.asarray(np.abs((first * second).sum(axis=1)) > np.cos(np.radians(30.0)))
 
 
-def _nearest(source: Landmarks, target: Landmarks, points: Float, reach: float) -> tuple[Integer, Float, Float]:
-    """Return for each point of the source, moved to ``points``, the nearest target sample of its kind.
+def _nearest(
+    source: Landmarks, target: Landmarks, chosen: Rows, points: Float, reach: float
+) -> tuple[Integer, Float, Float]:
+    """Return the nearest target sample of their kind for some samples of the source, moved to ``points``.
 
-    Returns:
-        ``(n,)`` rows of the target, -1 for none or for another direction; ``(n,)`` distances across the line;
-        ``(n, 2)`` unit normals.
+    That is ``(n,)`` rows (-1 for none or for another direction), distances across the line and ``(n, 2)`` unit normals.
     """
     rows = np.full(len(points), -1, dtype=np.int64)
     for kind, (members, tree) in target.trees.items():
-        own = np.flatnonzero(source.kinds == kind)
+        own = np.flatnonzero(source.kinds[chosen] == kind)
         if len(own):
             distance, nearest = tree.query(points[own], distance_upper_bound=reach)
             hit = np.isfinite(distance)
             rows[own[hit]] = members[nearest[hit]]
     tangent = target.samples.tangents[np.maximum(rows, 0)] if len(target.samples) else np.zeros((len(points), 2))
-    rows[np.abs((source.samples.tangents * tangent).sum(axis=1)) < np.cos(np.radians(30.0))] = -1
+    rows[~_alike(source.samples.tangents[chosen], tangent)] = -1
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     base = target.samples.points[np.maximum(rows, 0)] if len(target.samples) else points
     return rows, ((base - points) * normal).sum(axis=1), normal
-
-
-def _score(source: Landmarks, target: Landmarks, common: Rows, motion: Alignment, shifts: Float) -> Float:
-    """Return how well maps agree under a motion and each of some shifts after it, ``(n,)``; larger is better."""
-    thin = common[:: max(1, len(common) // SEARCH_SAMPLES)]
-    moved = motion.apply(source.samples.points[thin])[None, :, :] + shifts[:, None, :]
-    score = np.zeros(len(shifts))
-    for kind, (members, tree) in target.trees.items():
-        own = np.flatnonzero(source.kinds[thin] == kind)
-        if not len(own):
-            continue
-        distance, nearest = tree.query(moved[:, own].reshape(-1, 2), distance_upper_bound=2.0)
-        hit = np.isfinite(distance)
-        tangent = target.samples.tangents[members[np.where(hit, nearest, 0)]]
-        directions = np.tile(source.samples.tangents[thin[own]], (len(shifts), 1))
-        along = np.abs((directions * tangent).sum(axis=1)) > np.cos(np.radians(30.0))
-        value = np.where(hit & along, np.exp(-0.5 * (np.where(hit, distance, 9.0) / 0.6) ** 2), 0.0)
-        score += value.reshape(len(shifts), -1).sum(axis=1)
-    return score
 
 
 def _step(
@@ -254,20 +274,17 @@ def _step(
 ) -> tuple[Float, Float, float, Bool]:
     """One trimmed Gauss-Newton step.
 
-    Returns:
-        ``(3,)`` change of shift and turn; ``(3, 3)`` information; root mean square residual, metres; ``(n,)`` which of
-        the common samples agree.
+    Returns the change of shift and turn ``(3,)``, its information ``(3, 3)``, the root mean square residual in metres,
+    and which of the common samples agree.
     """
-    samples = source.samples
-    moved = move(samples.points, centre, shift, turn)
-    rows, across, normal = _nearest(source, target, moved, float(np.hypot(reach, config.spacing)))
-    rows, across, normal = rows[common], across[common], normal[common]
+    moved = move(source.samples.points[common], centre, shift, turn)
+    rows, across, normal = _nearest(source, target, common, moved, float(np.hypot(reach, config.spacing)))
     agreed = (rows >= 0) & (np.abs(across) < reach)
     if np.count_nonzero(agreed) < 3:
         return np.zeros(3), np.zeros((3, 3)), np.inf, agreed
     residual = np.abs(across[agreed])
     kept = np.flatnonzero(agreed)[residual <= np.quantile(residual, 0.8)]
-    lever = moved[common][kept] - centre - shift
+    lever = moved[kept] - centre - shift
     side = np.stack([-lever[:, 1], lever[:, 0]], axis=1)
     design = np.column_stack([normal[kept], (normal[kept] * side).sum(axis=1)])
     normal_matrix = design.T @ design

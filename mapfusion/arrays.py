@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float: TypeAlias = NDArray[np.float64]
+Float32: TypeAlias = NDArray[np.float32]
 Integer: TypeAlias = NDArray[np.int64]
+Integer32: TypeAlias = NDArray[np.int32]
+Byte: TypeAlias = NDArray[np.uint8]
 Bool: TypeAlias = NDArray[np.bool_]
 Rows: TypeAlias = NDArray[np.intp]
 Marks: TypeAlias = NDArray[np.uint64]

@@ -13,12 +13,9 @@ LineEnd: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True)
 class Chain(Generic[Line]):
-    """Lines put together end to end.
+    """Lines put together end to end: the ``members`` by number, in their order, and the line that they are.
 
-    Attributes:
-        line: what they are together.
-        members: numbers of the lines, in their order.
-        head, tail: the ends that ``line`` starts and stops with.
+    ``head`` and ``tail`` are the ends that it starts and stops with.
     """
 
     line: Line

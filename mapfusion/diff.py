@@ -89,11 +89,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class MapDiff:
-    """Differences between two maps.
+    """Differences between two maps, by change and kind, in the order of the maps.
 
-    Attributes:
-        differences: by change and kind, in the order of the maps.
-        alignment: how the new map was brought onto the old one; ``certain`` is False where it was left as it is.
+    ``alignment`` is how the new map was brought onto the old one; not ``certain`` where it was left as it is.
     """
 
     differences: tuple[Difference, ...]
@@ -128,18 +126,13 @@ def diff_maps(
     plane: InvertibleGeoreference | None = None,
     config: DiffConfig | None = None,
 ) -> MapDiff:
-    """Compare two maps in one metric frame.
+    """Compare two maps in one metric frame, to which ``plane`` leads from the degrees of the ground that they observed.
 
     Lines are compared sample by sample along their length; a stretch of the new map is the partner of one
     stretch of the old one only, so that a double line that became a single one shows. What lies farther off than
     :attr:`DiffConfig.tolerance` has moved, unless that is within what the maps state of their own uncertainty. What
     the old map has and the new one lacks is removed where the new map's drive has looked
     (:func:`mapfusion.ground.coverage`), else unobserved.
-
-    Args:
-        old, new: the maps, metres.
-        plane: leads from degrees to that frame, for maps that say what ground they observed.
-        config: what counts as a change.
     """
     config = config or DiffConfig()
     ground = coverage(new, plane)
@@ -162,9 +155,7 @@ def write_diff(
 ) -> None:
     """Write a diff as GeoJSON: LineStrings (crossings Polygons) with ``change``, ``kind``, ``length_m``, ``moved_m``.
 
-    Raises:
-        ValueError: coordinates that are not on the globe.
-        OSError: the file cannot be written.
+    Raises ValueError for coordinates that are not on the globe, OSError if the file cannot be written.
     """
     features = [_feature(item, georeference) for item in difference.differences]
     origin = origin_of(provenance or {}, georeference)
@@ -284,10 +275,10 @@ def _compare_rings(
             limit = max(config.tolerance, config.sure * float(np.hypot(_spread(element), _spread(new[partner]))))
             same = shift <= limit or overlap[i, partner] >= config.ring_overlap
             change, shown = (Change.UNCHANGED, element) if same else (Change.MOVED, new[partner])
-        result.append(Difference(change, kind, shown.points, shown.length, shift, shown.confidence))
+        result.append(Difference(change, kind, shown.points, shown.extent[0], shift, shown.confidence))
     missing = (element for j, element in enumerate(new) if j not in taken_new)
     return result + [
-        Difference(Change.ADDED, kind, element.points, element.length, float("nan"), element.confidence)
+        Difference(Change.ADDED, kind, element.points, element.extent[0], float("nan"), element.confidence)
         for element in missing
     ]
 

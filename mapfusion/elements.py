@@ -8,6 +8,7 @@ from enum import IntEnum
 from typing import Any, TypeAlias
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Bool, Float, Integer
@@ -183,6 +184,15 @@ class MapElement:
         return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
 
     @property
+    def extent(self) -> tuple[float, float]:
+        """Longer and shorter side of the smallest rectangle around a crossing, metres; length of a line, and 0."""
+        if not self.kind.is_ring:
+            return self.length, 0.0
+        corners = shapely.get_coordinates(shapely.oriented_envelope(shapely.LinearRing(self.points)))
+        sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1).tolist()
+        return max(sides, default=0.0), min(sides, default=0.0)
+
+    @property
     def origins(self) -> Origins:
         """Ids of the tracks by source; those of a nameless one, ``""``, if no source is named."""
         if not self.sources:
@@ -194,6 +204,12 @@ class MapElement:
         """Return it with some of its vertices, or all in another order, by their rows."""
         deviation, heights = (None if values is None else values[rows] for values in (self.deviation, self.heights))
         return replace(self, points=self.points[rows], deviation=deviation, heights=heights)
+
+    def counter_clockwise(self) -> MapElement:
+        """Return a ring that turns counter-clockwise; a line as it is."""
+        x, y = (self.points - self.points[0]).T
+        turns_back = self.kind.is_ring and float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum()) < 0.0
+        return self.with_vertices(np.arange(len(x))[::-1]) if turns_back else self
 
     def with_origins(self, origins: Origins) -> MapElement:
         """Return it with other sources and tracks."""
@@ -245,5 +261,5 @@ class GlobalMap:
         return GlobalMap(elements, self.provenance, self.notes)
 
     def length(self, kind: ElementKind) -> float:
-        """Total length of one kind, metres."""
-        return sum(element.length for element in self.of_kind(kind))
+        """Total length of one kind, metres; of crossings the sum of their longer sides."""
+        return sum(element.extent[0] for element in self.of_kind(kind))

@@ -15,10 +15,7 @@ def write_whole(path: Path) -> Iterator[Path]:
     """Yield a temporary name beside ``path`` that becomes the file if the block succeeds, and vanishes if not.
 
     The content reaches the disk before the rename, so that not even a power cut leaves half a file. The temporary name
-    has the ending of ``path``, since some writers choose the format by it.
-
-    Args:
-        path: file to write; its folder exists, and a file that is there already is replaced.
+    has the ending of ``path``, since some writers choose the format by it. The folder has to exist.
 
     Raises:
         OSError: the file cannot be written, or another program has it open.

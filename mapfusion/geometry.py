@@ -14,27 +14,15 @@ UNIT_TOLERANCE = 1e-14
 
 
 def arc_length(points: Float) -> Float:
-    """Return the distance along a line at each vertex.
-
-    Args:
-        points: ``(n, 2)``, metres.
-
-    Returns:
-        ``(n,) float64``, metres, starting at 0.
-    """
+    """Return the distance along a line ``(n, 2)`` at each vertex, metres, ``(n,)``, from 0."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def resample(points: Float, count: int) -> Float:
-    """Return ``count`` points at equal distances along a line, both ends included.
+    """Return ``count`` points (at least 2) at equal distances along a line ``(n, 2)``, both ends included.
 
-    Args:
-        points: ``(n, 2)``, ``n >= 1``; a line without length repeats its first point.
-        count: number of points, at least 2.
-
-    Returns:
-        ``(count, 2) float64``.
+    A line without length repeats its first point.
     """
     distance = arc_length(points)
     if distance[-1] == 0.0:
@@ -44,14 +32,11 @@ def resample(points: Float, count: int) -> Float:
 
 
 def tangents(points: Float, stops: Integer | None = None) -> Float:
-    """Return unit directions at the vertices of lines, from their neighbours.
+    """Return unit directions ``(n, 2)`` at the vertices of lines, from their neighbours.
 
     Args:
         points: ``(n, 2)``, metres, lines of at least two vertices end to end.
         stops: ascending, past the last vertex of each line; one line if None.
-
-    Returns:
-        ``(n, 2) float64``.
     """
     stops = np.array([len(points)]) if stops is None else stops
     step = np.empty_like(points)
@@ -79,14 +64,7 @@ def rigid_pose_problem(a_to_b: Float) -> str | None:
 
 
 def rotation_of_quaternion(quaternion: Float) -> Float:
-    """Return the rotation matrices of quaternions.
-
-    Args:
-        quaternion: ``(..., 4)``, order w, x, y, z; normalised here.
-
-    Returns:
-        ``(..., 3, 3) float64``.
-    """
+    """Return the rotations ``(..., 3, 3)`` of quaternions ``(..., 4)``, order w, x, y, z; normalised here."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     square = w * w + x * x + y * y + z * z
     # Order and grouping of the operations are those of the reader that the official data sets use. Their ground truth
@@ -103,15 +81,7 @@ def rotation_of_quaternion(quaternion: Float) -> Float:
 
 
 def transform_points(a_to_b: Float, points_a: Float) -> Float:
-    """Move points of the plane z = 0 of frame a to frame b and drop z.
-
-    Args:
-        a_to_b: ``(4, 4)`` pose.
-        points_a: ``(n, 2)``, metres.
-
-    Returns:
-        ``(n, 2) float64``, metres, frame b.
-    """
+    """Move points ``(n, 2)``, metres, of the plane z = 0 of frame a to frame b by a pose ``(4, 4)``, and drop z."""
     return points_a @ a_to_b[:2, :2].T + a_to_b[:2, 3]
 
 
@@ -131,16 +101,9 @@ def simplified_rows(points: Float, tolerance: float) -> Integer:
 
 
 def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
-    """Cut a line at the ROI and return the parts inside, in the order of the line (Liang and Barsky, 1984).
+    """Cut a line ``(n, 2)``, ego frame, at the ROI: the parts inside, in its order (Liang and Barsky, 1984).
 
     A line that crosses itself is cut at the border only.
-
-    Args:
-        points: ``(n, 2)``, metres, ego frame.
-        roi: the rectangle around the ego origin.
-
-    Returns:
-        List of ``(k, 2) float64`` with ``k >= 2``.
     """
     half = roi.size / 2
     points = points[np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))]
@@ -164,8 +127,7 @@ def clip_line(points: Float, roi: RegionOfInterest) -> list[Float]:
 def chamfer_distance(first: Float, second: Float) -> float:
     """Return the mean of the two directed mean nearest-point distances, metres (as in the chamfer AP of the field).
 
-    Args:
-        first, second: ``(n, 2)`` and ``(m, 2)`` point sets, usually densely resampled lines.
+    Point sets ``(n, 2)`` and ``(m, 2)`` are usually densely resampled lines.
     """
     forward = cKDTree(second).query(first)[0].mean()
     backward = cKDTree(first).query(second)[0].mean()

@@ -16,11 +16,7 @@ FARTHEST = 100_000.0
 
 
 def check_reach(points: Float, name: str) -> None:
-    """Check that ``(n, 2)`` points, metres, lie within 100 km of the origin of the frame ``name``.
-
-    Raises:
-        ValueError: they do not; such a frame is not what the points are in.
-    """
+    """Raise ValueError unless points ``(n, 2)``, metres, lie within 100 km of the origin of the frame ``name``."""
     if len(points) and float(np.abs(points).max()) > FARTHEST:
         farthest = points[int(np.abs(points).max(axis=1).argmax())]
         raise ValueError(
@@ -36,11 +32,9 @@ class Georeference(Protocol):
     @property
     def name(self) -> str:
         """Name of the metric frame, for a file's metadata."""
-        ...
 
     def to_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` metres, global frame, to ``(n, 2)`` longitude and latitude, degrees."""
-        ...
 
 
 class InvertibleGeoreference(Georeference, Protocol):
@@ -48,4 +42,3 @@ class InvertibleGeoreference(Georeference, Protocol):
 
     def from_wgs84(self, points: Float) -> Float:
         """Map ``(n, 2)`` longitude and latitude, degrees, to ``(n, 2)`` metres, global frame."""
-        ...

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 
 import numpy as np
 import shapely
@@ -39,12 +39,9 @@ metres."""
 
 @dataclass(frozen=True)
 class CameraSector:
-    """Horizontal sector that a camera looks at, without a far end.
+    """Horizontal sector that a camera looks at, without a far end: from a position ``(2,)``, metres, ego frame.
 
-    Attributes:
-        position: ``(2,) float64``, metres, ego frame.
-        heading: of the optical axis, radians from x (forward) towards y (left).
-        field_of_view: horizontal, radians, at most a full turn.
+    The heading of its axis is in radians from x (forward) towards y (left), its field at most a full turn.
     """
 
     position: Float
@@ -91,10 +88,8 @@ def visible_ground(
     Example:
         >>> truck = np.array([[5.0, 2.0], [13.0, 2.0], [13.0, 4.5], [5.0, 4.5]])
         >>> rings = visible_ground(RegionOfInterest(), [CameraSector(np.zeros(2))], [truck])
-        >>> bool(shapely.contains_xy(ground_within(rings), 15.0, 8.0)), bool(
-        ...     shapely.contains_xy(ground_within(rings), 15.0, -8.0)
-        ... )
-        (False, True)
+        >>> shapely.contains_xy(ground_within(rings), [15.0, 15.0], [8.0, -8.0]).tolist()
+        [False, True]
     """
     reach = 2.0 * float(np.hypot(*roi.size))
     seen = []
@@ -117,13 +112,8 @@ def ground_problem(frame_map: FrameMap) -> str | None:
     return None
 
 
-def frame_ground(frame_map: FrameMap) -> shapely.Geometry:
-    """Return the ground that was looked at in a frame, global frame, metres."""
-    return _placed(_ego_ground(frame_map), frame_map)
-
-
 def seen_along(frame_maps: Iterable[FrameMap]) -> shapely.Geometry:
-    """Return the ground that was looked at on a drive: the union of :func:`frame_ground`, global frame, metres.
+    """Return the ground that was looked at on a drive: the union over its frames, global frame, metres.
 
     Frames that share one ``visible`` (one rig, all cameras there) share its outline, which makes 10,000 of them a
     matter of seconds.
@@ -134,8 +124,8 @@ def seen_along(frame_maps: Iterable[FrameMap]) -> shapely.Geometry:
     for frame_map in frame_maps:
         if last is None or frame_map.visible is not last.visible or frame_map.roi != last.roi:
             ego_ground = _ego_ground(frame_map)
-        last = frame_map
-        grounds.append(_placed(ego_ground, frame_map))
+        last, pose = frame_map, frame_map.ego_to_global
+        grounds.append(shapely.transform(ego_ground, partial(transform_points, pose)))
     return shapely.union_all(grounds)
 
 
@@ -146,20 +136,13 @@ def _ego_ground(frame_map: FrameMap) -> shapely.Geometry:
     return shapely.intersection(ground, ground_within(frame_map.visible))
 
 
-def _placed(ego_ground: shapely.Geometry, frame_map: FrameMap) -> shapely.Geometry:
-    return shapely.transform(ego_ground, lambda points: transform_points(frame_map.ego_to_global, points))
-
-
 def coverage(global_map: GlobalMap, plane: InvertibleGeoreference | None = None) -> shapely.Geometry:
     """Return the ground that a map speaks of, metres, in the map's frame.
 
     A map that says so itself is believed: ``provenance["observed"]`` holds rings of longitude and latitude, as
-    ``predmapnet infer`` writes them from the drive. Otherwise it is the ground near its elements: the car passed where
-    it found something, and a detector that found the kerb would have found the crossing beside it.
-
-    Args:
-        global_map: the map.
-        plane: leads from degrees to the map's frame; without it the second way is taken.
+    ``predmapnet infer`` writes them from the drive. Otherwise, or without a ``plane`` that leads from degrees to the
+    map's frame, it is the ground near its elements: the car passed where it found something, and a detector that
+    found the kerb would have found the crossing beside it.
     """
     observed = global_map.provenance.get("observed")
     if observed and plane is not None:

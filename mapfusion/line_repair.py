@@ -20,8 +20,7 @@ CLOSING_GAP = 2.0
 def hairpins(points: Float) -> list[int]:
     """Return the rows at which a line of stations turns back for good: the tip of a gore is an end of two lines.
 
-    Args:
-        points: ``(n, 2)``, metres, about one metre apart.
+    Its points ``(n, 2)`` lie about one metre apart.
     """
     if len(points) < 2 * HAIRPIN + 1:
         return []
@@ -37,14 +36,7 @@ def hairpins(points: Float) -> list[int]:
 
 
 def repaired_rows(points: Float) -> Integer:
-    """Return the vertices of a line that remain when spikes and loops are taken out.
-
-    Args:
-        points: ``(n, 2)``, metres.
-
-    Returns:
-        Ascending rows of ``points``.
-    """
+    """Return the rows of a line's vertices ``(n, 2)``, metres, that remain when spikes and loops are taken out."""
     rows = np.arange(len(points))
     while len(rows) > 2:
         moved = np.append(True, np.any(points[rows[1:]] != points[rows[:-1]], axis=1))

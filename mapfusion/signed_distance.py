@@ -36,17 +36,14 @@ _SEGMENTS: dict[int, tuple[tuple[int, int], ...]] = {
 
 
 def signed_distance(x: Float, y: Float, ring: Float, counts: Bool | None = None, dtype: type = np.float64) -> Grid:
-    """Return the truncated signed distance from cells to a ring; edges that do not count bound it all the same.
+    """Return the signed distance from cells to a closed ring, metres, positive inside, up to :data:`TRUNCATION`.
 
     Args:
         x: ``(rows,)``, metres.
         y: ``(columns,)``, metres.
         ring: ``(n + 1, 2)``, closed.
-        counts: ``(n,)``, which edges distances are taken to; all if None.
+        counts: ``(n,)``, which edges distances are taken to, all if None; the others bound the ring all the same.
         dtype: type of the numbers.
-
-    Returns:
-        ``(rows, columns)``, metres, positive inside, at most :data:`TRUNCATION`.
     """
     origin = np.array([x[0], y[0]])
     start, stop = (ring[:-1] - origin).astype(dtype), (ring[1:] - origin).astype(dtype)
@@ -75,14 +72,9 @@ def signed_distance(x: Float, y: Float, ring: Float, counts: Bool | None = None,
 
 
 def positive_areas(values: Float) -> list[shapely.Polygon]:
-    """Return the outlines of the areas where a grid is positive (marching squares).
+    """Return the outlines of the areas where a grid is positive (marching squares), outer rings only, largest first.
 
-    Args:
-        values: ``(rows, columns)``; outside the grid counts as negative.
-
-    Returns:
-        Polygons with vertices in grid coordinates, ``(0, 0)`` at the centre of the first cell; outer rings only,
-        largest first.
+    ``(0, 0)`` is the centre of the first cell; outside the grid counts as negative.
     """
     grid = np.pad(values, 1, constant_values=min(float(values.min()), 0.0))
     grid = np.where(grid == 0.0, 1e-9, grid)

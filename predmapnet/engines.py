@@ -39,7 +39,6 @@ class Engine(Protocol):
 
     def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
         """Map one frame; a state of None begins a stream, and the one given is not changed."""
-        ...
 
 
 class TorchEngine:

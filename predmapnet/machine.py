@@ -13,6 +13,14 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+THREADS_PER_SCENE = 1
+"""CPU threads with which a scene is mapped unless a user says otherwise, alone or beside others: the order of sums, and
+with it the last digits of a map, depends on them."""
+
+
+WORKER_MEMORY = 2 * 2**30
+"""Memory that a worker of a batch may need, bytes."""
+
 
 class Precision(StrEnum):
     """Numbers that the image backbone and the BEV encoder compute with; everything else computes in float32."""
@@ -88,6 +96,14 @@ def _keep_freed_memory() -> None:
 def available_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
+def workers_that_fit(device: str) -> int:
+    """Number of workers of a batch: one on a GPU; else one a core, one core left free, as many as the memory holds."""
+    if device != "cpu" and Path("/proc/driver/nvidia/gpus").is_dir():
+        return 1
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return max(1, min(available_cores() - 1, memory // WORKER_MEMORY))
 
 
 def begin_worker(threads: int) -> None:

@@ -29,11 +29,9 @@ from predmapnet.weights.checkpoint import load_checkpoint
 
 @dataclass(frozen=True)
 class CameraImages:
-    """Images of one instant as the network wants them.
+    """Images of one instant as the network wants them: windows ``(N, h, w, 3)``, RGB, 0 to 255, in the rig's order.
 
-    Attributes:
-        windows: ``(N, h, w, 3)``, RGB, 0 to 255, in the order of the rig; black where there is no image.
-        valid: ``(N,) bool``.
+    They are black where there is no image (``valid (N,) bool``).
     """
 
     windows: WindowPixels
@@ -79,11 +77,7 @@ class Mapper:
 
     @classmethod
     def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
-        """Load a network; without options the shipped weights.
-
-        Raises:
-            UserError: the weights, the device or a compiler are not there.
-        """
+        """Load a network; without options the shipped weights. Raises UserError without weights, device or compiler."""
         options = options or NetworkOptions()
         if options.engine is EngineKind.ONNX or (options.weights is not None and options.weights.is_dir()):
             from predmapnet.export.engine import OnnxEngine
@@ -135,21 +129,17 @@ class Mapper:
         images: CameraImages | None = None,
         allow_missing_cameras: bool = False,
     ) -> tuple[FrameMap, StreamState]:
-        """Map one frame.
+        """Map the next frame of a log.
 
         Args:
             frame: the next of its log.
             state: returned by the step before; None begins a log.
             images: of this frame, if :meth:`read_images` was called ahead; read here otherwise.
-            allow_missing_cameras: as in :meth:`read_images`.
+            allow_missing_cameras: as in :meth:`read_images`, which also says what errors there are.
 
         Returns:
             The map of this instant, ``visible`` saying what ground the cameras with an image cover, and the state for
             the next step. ``state`` itself is not changed.
-
-        Raises:
-            UserError: an image is missing, damaged, or not of its camera's size, or the car has other cameras than the
-                network has learned.
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
@@ -168,11 +158,7 @@ class Mapper:
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device of a name; ``auto`` is a GPU if there is one.
-
-    Raises:
-        UserError: there is no such device here.
-    """
+    """Return the device of a name (``auto``: a GPU if there is one); raises UserError where it does not exist."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -205,13 +191,7 @@ def to_frame_map(
 ) -> FrameMap:
     """Return the frame map of one stream: tracks first, then detections without a track.
 
-    Args:
-        selection: result of :func:`predmapnet.network.track_selection.select`.
-        state: after the frame.
-        segmentation: ``(1, 3, H_s, W_s)`` logits.
-        config: of the network.
-        timestamp: nanoseconds.
-        ego_to_global: ``(4, 4) float64``.
+    The state is that after the frame; ``segmentation`` is ``(1, 3, H_s, W_s)`` logits.
     """
     tracks, others = _rows(selection.instances), _rows(selection.detections)
     kinds = np.concatenate([tracks["labels"], others["labels"]])

@@ -54,15 +54,12 @@ class Observer(Protocol):
 
     def begin(self, scene: Scene, roi: RegionOfInterest) -> None:
         """Called once before the first frame."""
-        ...
 
     def observe(self, step: Step, snapshot: MapSnapshot) -> None:
         """Called after each frame."""
-        ...
 
     def end(self, global_map: GlobalMap) -> None:
         """Called once after the last frame."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,16 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from predmapnet.config import (
-    ALL_QUIRKS,
     BevFormerConfig,
+    DecoderQuirks,
     DepthConfig,
-    EncoderBevMemoryConfig,
+    EncoderQuirks,
     FutureConfig,
     HistoryMapConfig,
     LookupBevConfig,
     MapTrackerDecoderConfig,
     MaskConfig,
     PredMapNetConfig,
-    ResNet50Config,
     RevivalConfig,
     SegmentationConfig,
     SemanticQueriesConfig,
@@ -34,18 +33,15 @@ def _maptracker(name: str, image: WholeImageConfig, cameras: tuple[str, ...]) ->
     return PredMapNetConfig(
         name=name,
         image=image,
-        backbone=ResNet50Config(),
-        bev=BevFormerConfig(cameras=cameras),
-        temporal_bev=EncoderBevMemoryConfig(),
+        bev=BevFormerConfig(cameras=cameras, quirks=EncoderQuirks.official()),
         segmentation=SegmentationConfig(kind="upsampling"),
         semantic_queries=SemanticQueriesConfig(enabled=False),
-        masks=MaskConfig(stride=1, channels=256),
+        masks=MaskConfig(channels=256),
         history_map=HistoryMapConfig(memory=False, guidance=False),
         future=FutureConfig(enabled=False),
-        decoder=MapTrackerDecoderConfig(),
+        decoder=MapTrackerDecoderConfig(quirks=DecoderQuirks.official()),
         revival=RevivalConfig(enabled=False),
         tracking=TrackingConfig(
-            query_assignment="suppress",
             tau_d=0.6,
             first_tau_d=0.4,
             tau_t=0.5,
@@ -53,7 +49,6 @@ def _maptracker(name: str, image: WholeImageConfig, cameras: tuple[str, ...]) ->
             merge=False,
             report_threshold=0.0,
         ),
-        quirks=ALL_QUIRKS,
     )
 
 
@@ -91,11 +86,7 @@ PRESETS = {
 
 
 def preset(name: str) -> PredMapNetConfig:
-    """Return a named configuration.
-
-    Raises:
-        UserError: there is no such preset.
-    """
+    """Return a named configuration; raises UserError where there is none of that name."""
     if name not in PRESETS:
         raise UserError(f"there is no preset '{name}'; choose one of: {', '.join(sorted(PRESETS))}")
     return PRESETS[name]
@@ -125,16 +116,12 @@ def _said(place: str, message: str) -> str:
 
 def _place(location: tuple[int | str, ...]) -> str:
     """Name a key as the file has it: pydantic puts a section's kind behind the section's name."""
-    kinds = {"image", "backbone", "bev", "temporal_bev", "decoder"}
+    kinds = {"image", "bev", "decoder"}
     return ".".join(str(part) for at, part in enumerate(location) if at != 1 or location[0] not in kinds)
 
 
 def load_config(name_or_path: str | Path) -> PredMapNetConfig:
-    """Return a preset by name, or read a ``.json`` file.
-
-    Raises:
-        UserError: no such preset or file, or the file does not fit.
-    """
+    """Return a preset by name, or read a ``.json`` file; raises UserError where there is none, or it does not fit."""
     path = Path(name_or_path)
     if path.suffix != ".json":
         return preset(str(name_or_path))

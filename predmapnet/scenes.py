@@ -161,43 +161,34 @@ class Scene(Protocol):
     @property
     def info(self) -> SceneInfo:
         """The scene's line in the listing."""
-        ...
 
     @property
     def rig(self) -> Rig:
         """The car's cameras. Raises UserError for a log whose cameras are not known."""
-        ...
 
     @property
     def georeference(self) -> Georeference | None:
         """Georeference of the global frame, if it is known."""
-        ...
 
     def __len__(self) -> int: ...
 
     def frame(self, index: int) -> Frame:
         """Return frame ``index``; images are named, not read. Raises UserError for a broken pose."""
-        ...
 
     def instant(self, index: int) -> Instant:
         """Return token, time stamp and pose of frame ``index``. Raises UserError for a broken pose."""
-        ...
 
     def lidar(self, index: int) -> Float | None:
         """Return the lidar sweep of frame ``index``, ``(n, 3)``, metres, ego frame; None where there is no file."""
-        ...
 
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the ground truth of frame ``index``, or None where the source has no map."""
-        ...
 
     def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
         """Return the ground truth of all frames, kept in the folder ``cache`` if one is given; None without a map."""
-        ...
 
     def truth_map(self) -> GlobalMap | None:
         """Return the ground-truth map of the whole log in the global frame, unclipped, or None."""
-        ...
 
 
 class SceneSource(Protocol):
@@ -206,26 +197,20 @@ class SceneSource(Protocol):
     @property
     def name(self) -> str:
         """``nuscenes``, ``argoverse2``, ``log`` or ``demo``."""
-        ...
 
     @property
     def root(self) -> Path:
         """Folder of the data set."""
-        ...
 
     @property
     def synthetic(self) -> bool:
         """Whether its images were rendered."""
-        ...
 
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List what is there, in the data set's order; ``split`` narrows it. Raises UserError."""
-        ...
 
     def open(self, scene: str, progress: Progress | None = None) -> Scene:
         """Open one scene by name; a name that does not exist raises UserError with the nearest names."""
-        ...
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to: names of scenes by frame token. Unknown tokens are absent."""
-        ...

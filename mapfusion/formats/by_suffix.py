@@ -13,11 +13,17 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
-from mapfusion.formats.geodatabase import geodatabase_box, read_geodatabase, write_geodatabase
+from mapfusion.formats.argoverse2_archive import read_argoverse2, write_argoverse2
+from mapfusion.formats.geodatabase import write_geodatabase
+from mapfusion.formats.geodatabase_reader import geodatabase_box, read_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
 from mapfusion.formats.lanelet2 import write_lanelet
 from mapfusion.formats.lanelet2_reader import read_lanelet
 from mapfusion.formats.local_plane import LocalPlane, common_plane
+from mapfusion.formats.nuscenes_expansion import read_nuscenes, write_nuscenes
+from mapfusion.formats.opendrive import write_opendrive
+from mapfusion.formats.opendrive_reader import read_opendrive
+from mapfusion.formats.reference_systems import FromDegrees
 from mapfusion.georeference import LOCAL_FRAME, Georeference, InvertibleGeoreference
 
 SUFFIXES = {
@@ -26,27 +32,79 @@ SUFFIXES = {
     ".gpkg": "GeoPackage",
     ".fgb": "FlatGeobuf",
     ".osm": "Lanelet2",
+    ".xodr": "OpenDRIVE",
+    ".nuscenes.json": "nuScenes",
+    ".argoverse2.json": "Argoverse 2",
 }
-"""Endings of the files that hold maps, and the format of each."""
+"""Endings of the files that hold maps, and the format of each; where several fit, the longest counts."""
 
-_WRITERS = {"GeoPackage": write_geodatabase, "FlatGeobuf": write_geodatabase, "Lanelet2": write_lanelet}
-_READERS = {"GeoPackage": read_geodatabase, "FlatGeobuf": read_geodatabase, "Lanelet2": read_lanelet}
+_WRITERS = {
+    "GeoJSON": write_geojson,
+    "GeoPackage": write_geodatabase,
+    "FlatGeobuf": write_geodatabase,
+    "Lanelet2": write_lanelet,
+    "OpenDRIVE": write_opendrive,
+    "nuScenes": write_nuscenes,
+    "Argoverse 2": write_argoverse2,
+}
+_READERS = {
+    "GeoJSON": read_geojson,
+    "GeoPackage": read_geodatabase,
+    "FlatGeobuf": read_geodatabase,
+    "Lanelet2": read_lanelet,
+    "OpenDRIVE": read_opendrive,
+    "nuScenes": read_nuscenes,
+    "Argoverse 2": read_argoverse2,
+}
+
+
+_ONE_SYSTEM = {
+    "GeoJSON": "RFC 7946 allows longitude and latitude (WGS84) alone",
+    "Lanelet2": "its nodes have latitude and longitude",
+    "OpenDRIVE": "it is projected about the origin of the map's frame",
+}
+"""Why a format has one reference system."""
+
+
+def map_suffix(path: Path) -> str | None:
+    """Return the ending of a name that stands for a map format, in lower case; None if it has none."""
+    return max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len, default=None)
 
 
 def check_suffix(path: Path) -> str:
     """Return the format that the ending of a name stands for; raises ValueError for other endings."""
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = map_suffix(path)
+    if suffix is None:
         endings = ", ".join(f"{suffix} ({name})" for suffix, name in SUFFIXES.items())
         raise ValueError(f"{path}: the ending '{path.suffix}' stands for no map format; use one of {endings}")
-    return SUFFIXES[path.suffix.lower()]
+    return SUFFIXES[suffix]
+
+
+def check_crs(path: Path, crs: str | None) -> None:
+    """Check that a map can be written in a reference system, an EPSG code; None is the one of the format.
+
+    Raises:
+        ValueError: the format has only one, or PROJ does not know it.
+    """
+    if crs is None:
+        return
+    name = check_suffix(path)
+    if name not in ("GeoPackage", "FlatGeobuf"):
+        reason = _ONE_SYSTEM.get(name, "its metres are those of the map's own frame")
+        raise ValueError(f"{path}: {name} cannot be written in {crs}: {reason}. Write .gpkg or .fgb for {crs}")
+    FromDegrees(crs)
 
 
 def write_map(
-    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+    global_map: GlobalMap,
+    path: Path,
+    georeference: Georeference,
+    provenance: Mapping[str, Any] | None = None,
+    crs: str | None = None,
 ) -> None:
     """Write a map in the format that the ending of the name asks for; the file appears complete or not at all.
 
-    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.01 mm, deviations to
+    Every format keeps all that a :class:`~mapfusion.elements.MapElement` holds: positions to 0.1 mm, deviations to
     1 mm and confidences to 0.0001. Rings turn counter-clockwise. :func:`read_map` gives it back.
 
     Args:
@@ -54,12 +112,17 @@ def write_map(
         path: file to write; an existing one is replaced.
         georeference: of that frame.
         provenance: what else the file should tell of its origin.
+        crs: reference system of a GeoPackage or FlatGeobuf (``EPSG:32632``); WGS84 without.
 
     Raises:
-        ValueError: an ending that stands for no format, or coordinates not on the globe.
+        ValueError: an ending that stands for no format, coordinates not on the globe, or a system that does not fit.
         OSError: the file cannot be written.
     """
-    _WRITERS.get(check_suffix(path), write_geojson)(global_map, path, georeference, provenance)
+    check_crs(path, crs)
+    if crs is not None:
+        write_geodatabase(global_map, path, georeference, provenance, crs)
+        return
+    _WRITERS[check_suffix(path)](global_map, path, georeference, provenance)
 
 
 class MapWriter:
@@ -71,13 +134,17 @@ class MapWriter:
         path: file to write; its ending says the format.
         georeference: of the metric frame.
         provenance: what the file should tell of its origin.
+        crs: as for :func:`write_map`.
 
     Raises:
         ValueError: an ending that stands for no format.
     """
 
-    def __init__(self, path: Path, georeference: Georeference, provenance: Mapping[str, Any]) -> None:
-        self._path, self._georeference, self._provenance = path, georeference, provenance
+    def __init__(
+        self, path: Path, georeference: Georeference, provenance: Mapping[str, Any], crs: str | None = None
+    ) -> None:
+        check_crs(path, crs)
+        self._path, self._georeference, self._provenance, self._crs = path, georeference, provenance, crs
         streams = check_suffix(path) == "GeoJSON"
         self._stream = GeoJsonWriter(path, georeference, provenance) if streams else None
         self._elements: list[MapElement] = []
@@ -93,7 +160,8 @@ class MapWriter:
         if self._stream is not None:
             self._stream.__exit__(kind, error, trace)
         elif kind is None:
-            write_map(GlobalMap(tuple(self._elements), self._provenance), self._path, self._georeference)
+            found = GlobalMap(tuple(self._elements), self._provenance)
+            write_map(found, self._path, self._georeference, crs=self._crs)
 
     def write(self, element: MapElement) -> None:
         """Append one element."""
@@ -116,7 +184,7 @@ def read_map(path: Path, georeference: InvertibleGeoreference | None = None) -> 
         ValueError: an ending that stands for no format, or a file that is not as it should be.
         OSError: the file cannot be read.
     """
-    return _READERS.get(check_suffix(path), read_geojson)(path, georeference)
+    return _READERS[check_suffix(path)](path, georeference)
 
 
 def read_maps(paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane]:
@@ -167,13 +235,13 @@ def read_box(path: Path) -> Float | None:
     match check_suffix(path):
         case "GeoPackage" | "FlatGeobuf":
             box = geodatabase_box(path)
-        case "Lanelet2":
-            box = _box_of_points(path)
-        case _:
+        case "GeoJSON":
             with path.open(encoding="utf-8-sig", errors="replace") as file:
                 head = file.read(512)
             found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
             box = json.loads(found[1]) if found else _box_of_points(path)
+        case _:
+            box = _box_of_points(path)
     if box is None:
         return None
     if len(box) == 6:  # with heights

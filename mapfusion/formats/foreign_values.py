@@ -71,6 +71,14 @@ def number_of(value: Any) -> float | None:
     return None if math.isnan(number) else number
 
 
+def json_of(text: str | None) -> Any:
+    """Return what JSON text holds; None for no text, or for what is no JSON."""
+    try:
+        return None if text is None else json.loads(text)
+    except ValueError:
+        return None
+
+
 def list_of(value: Any) -> list[Any] | None:
     """Return a list, also one that is written as JSON text; None for null. Raises ValueError."""
     if isinstance(value, str):

@@ -1,17 +1,20 @@
 """GeoPackage and FlatGeobuf files, through pyogrio (GDAL), with the properties of GeoJSON as columns.
 
 A GeoPackage has one layer of lines and one of crossings, because geographic information systems expect one type of
-geometry in a layer; a FlatGeobuf file has a single layer of both. Lists (``track_ids``, ``deviation_m`` and the
-like) and the provenance (metadata ``predmapnet``) are JSON texts. ``number`` keeps the order of the map.
+geometry in a layer, and one of the observed ground; QGIS finds their styles in it. A FlatGeobuf file has a single layer
+of lines and crossings. Times are dates of the format, to the millisecond; columns with ``_rest_ns`` have the
+nanoseconds after it. Lists (``track_ids``, ``deviation_m`` and the like) and the provenance (metadata ``predmapnet``)
+are JSON texts. ``number`` keeps the order of the map.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import sqlite3
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,86 +23,60 @@ import shapely
 import shapely.geometry
 
 from mapfusion.elements import GlobalMap
-from mapfusion.formats.features import HEIGHTS, Feature, map_of
-from mapfusion.formats.foreign_values import number_of
+from mapfusion.formats.features import HEIGHTS
+from mapfusion.formats.foreign_values import parse_timestamp
 from mapfusion.formats.geojson import feature_of, origin_of
 from mapfusion.formats.identities import all_named
-from mapfusion.formats.reading_notes import ReadingNotes
-from mapfusion.formats.reference_systems import ToDegrees
+from mapfusion.formats.qgis_style import layer_styles
+from mapfusion.formats.reference_systems import FromDegrees
 from mapfusion.formats.seal import write_sealed
-from mapfusion.georeference import Georeference, InvertibleGeoreference
+from mapfusion.georeference import Georeference
+from mapfusion.ground import ground_within
 
-LINES, CROSSINGS = "lines", "crossings"
+LINES, CROSSINGS, OBSERVED = "lines", "crossings", "observed"
 LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")
+TIMES, REST = ("first_seen", "last_seen"), "_rest_ns"
 FLAT = "FlatGeobuf"
 """Driver whose layers of lines and areas together have no heights."""
 METADATA = "predmapnet"
+WGS84 = "EPSG:4326"
+UTC_OFFSET = 100
+"""GDAL's code of times that are UTC."""
 
 
 def write_geodatabase(
-    global_map: GlobalMap, path: Path, georeference: Georeference, provenance: Mapping[str, Any] | None = None
+    global_map: GlobalMap,
+    path: Path,
+    georeference: Georeference,
+    provenance: Mapping[str, Any] | None = None,
+    crs: str = WGS84,
 ) -> None:
-    """Write a map as GeoPackage (``.gpkg``) or FlatGeobuf (``.fgb``), WGS84; complete or not at all.
+    """Write a map as GeoPackage (``.gpkg``) or FlatGeobuf (``.fgb``); complete or not at all.
 
     Raises:
-        ValueError: coordinates that are not on the globe.
+        ValueError: coordinates that are not on the globe, or lie where the reference system ``crs`` does not hold.
         OSError: the file cannot be written.
     """
     import pyogrio.errors
 
+    system = FromDegrees(crs)
     features = [feature_of(element, georeference) for element in all_named(global_map)]
     origin = origin_of({**global_map.provenance, **(provenance or {})}, georeference)
     rows = list(enumerate(features))
     with write_sealed(path) as temporary, _plain_folder(temporary) as plain:
         try:
             if path.suffix.lower() == ".fgb":
-                _write_layer(plain, FLAT, path.stem, "Unknown", rows, origin)
+                _write_layer(plain, FLAT, path.stem, "Unknown", rows, origin, system)
                 return
             crossings = [row for row in rows if row[1]["geometry"]["type"] == "Polygon"]
             lines = [row for row in rows if row[1]["geometry"]["type"] == "LineString"]
-            _write_layer(plain, "GPKG", LINES, "LineString", lines, origin)
-            _write_layer(plain, "GPKG", CROSSINGS, "Polygon", crossings, origin)
+            _write_layer(plain, "GPKG", LINES, "LineString", lines, origin, system)
+            _write_layer(plain, "GPKG", CROSSINGS, "Polygon", crossings, origin, system)
+            if origin.get("observed"):
+                _write_observed(plain, origin["observed"], system)
         except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError) as error:
             raise OSError(f"cannot write {path}: {error}") from error
-
-
-def read_geodatabase(path: Path, georeference: InvertibleGeoreference | None = None) -> GlobalMap:
-    """Read a map that :func:`write_geodatabase` wrote, also after another program or a person has edited it.
-
-    Layers of any reference system are read; those that are no map (styles, points) are left out, ``notes`` say so.
-    Arguments and result are those of :func:`mapfusion.formats.geojson.read_geojson`.
-
-    Raises:
-        ValueError: no map; says where it breaks.
-        OSError: the file cannot be read.
-    """
-    numbered: list[tuple[float, Feature]] = []
-    origin: Any = None
-    notes = ReadingNotes()
-    with plain_path(path) as plain, driver_errors_told(path):
-        for layer in _layers(plain, path, notes):
-            rows, told = _read_layer(plain, path, layer)
-            numbered.extend(rows)
-            origin = origin or told
-    features = [feature for _, feature in sorted(numbered, key=lambda row: row[0])]
-    return map_of(features, origin, path, georeference, notes)
-
-
-def geodatabase_box(path: Path) -> list[float] | None:
-    """Return west, south, east and north of a file, degrees, from its header or index; None if it is empty."""
-    import pyogrio
-
-    boxes = []
-    with plain_path(path) as plain, driver_errors_told(path):
-        for layer in _layers(plain, path, ReadingNotes()):
-            info = pyogrio.read_info(plain, layer=layer, force_total_bounds=True)
-            bounds = info["total_bounds"]
-            if info["features"] and bounds is not None and np.isfinite(bounds).all():
-                boxes.append(ToDegrees(str(info["crs"] or ""), f"{path}, layer {layer}").box(bounds))
-    if not boxes:
-        return None
-    table = np.array(boxes, dtype=np.float64)
-    return [*table[:, :2].min(axis=0).tolist(), *table[:, 2:].max(axis=0).tolist()]
+        _write_styles(plain, origin["created"].replace("Z", ".000Z"))
 
 
 def _write_layer(
@@ -109,122 +86,110 @@ def _write_layer(
     geometry_type: str,
     rows: Sequence[tuple[int, Mapping[str, Any]]],
     origin: Mapping[str, Any],
+    system: FromDegrees,
 ) -> None:
     from pyogrio import raw
 
-    properties = [feature["properties"] for _, feature in rows]
-    columns: dict[str, Any] = {"number": np.array([number for number, _ in rows], dtype=np.int64)}
-    columns["id"] = np.array([feature["id"] for _, feature in rows], dtype=object)
-    for name, kind in (
-        ("kind", object),
-        ("confidence", np.float64),
-        ("observations", np.int64),
-        ("first_seen", object),
-        ("last_seen", object),
-        ("length_m", np.float64),
-    ):
-        columns[name] = np.array([row[name] for row in properties], dtype=kind)
-    columns["paint"] = np.array([row.get("paint") for row in properties], dtype=object)
-    for name in LISTS:
-        texts = [json.dumps(row[name]) if name in row else None for row in properties]
-        columns[name] = np.array(texts, dtype=object)
+    columns = _columns([feature for _, feature in rows])
+    columns["number"] = np.array([number for number, _ in rows], dtype=np.int64)
     if driver == FLAT:
         columns[HEIGHTS] = np.array([_heights_text(feature["geometry"]) for _, feature in rows], dtype=object)
     shapes = np.array([shapely.geometry.shape(feature["geometry"]) for _, feature in rows], dtype=object)
     raw.write(
         path,
-        shapely.to_wkb(shapes),
+        shapely.to_wkb(_projected(shapes, system)),
         list(columns.values()),
         list(columns),
         layer=layer,
         driver=driver,
         geometry_type=geometry_type + (" Z" if driver != FLAT and shapely.has_z(shapes).any() else ""),
-        crs="EPSG:4326",
+        crs=system.name,
+        gdal_tz_offsets={name: np.full(len(rows), UTC_OFFSET, dtype=np.int32) for name in TIMES},
         layer_metadata={METADATA: json.dumps(dict(origin))},
+        **({} if driver == FLAT else {"DATETIME_PRECISION": "MILLISECOND"}),
     )
+
+
+def _columns(features: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the columns of a layer, each of its own type."""
+    properties = [feature["properties"] for feature in features]
+    columns: dict[str, Any] = {"id": np.array([feature["id"] for feature in features], dtype=object)}
+    for name, kind in (("kind", object), ("paint", object), ("confidence", np.float64), ("observations", np.int64)):
+        columns[name] = np.array([row.get(name) for row in properties], dtype=kind)
+    for name in TIMES:
+        moments = np.array([parse_timestamp(row[name]) for row in properties], dtype=np.int64)
+        columns[name] = (moments // 1_000_000).astype("datetime64[ms]")
+        columns[f"{name}{REST}"] = moments % 1_000_000
+    for name in ("length_m", "width_m"):
+        columns[name] = np.array([row.get(name, np.nan) for row in properties], dtype=np.float64)
+    means = [np.mean(row["deviation_m"]) if "deviation_m" in row else np.nan for row in properties]
+    columns["mean_deviation_m"] = np.array(means, dtype=np.float64).round(3)
+    for name in LISTS:
+        texts = [json.dumps(row[name]) if name in row else None for row in properties]
+        columns[name] = np.array(texts, dtype=object)
+    return columns
+
+
+def _write_observed(path: Path, rings: Sequence[Any], system: FromDegrees) -> None:
+    """Write the observed ground as a layer of areas."""
+    from pyogrio import raw
+
+    ground = ground_within([np.array(ring, dtype=np.float64) for ring in rings])
+    shapes = np.array([part for part in shapely.get_parts(ground) if part.geom_type == "Polygon"], dtype=object)
+    numbers = np.arange(len(shapes), dtype=np.int64)
+    raw.write(
+        path,
+        shapely.to_wkb(_projected(shapes, system)),
+        [numbers],
+        ["number"],
+        layer=OBSERVED,
+        driver="GPKG",
+        geometry_type="Polygon",
+        crs=system.name,
+        append=True,
+    )
+
+
+def _projected(shapes: Any, system: FromDegrees) -> Any:
+    """Return shapes of longitude and latitude in another system, heights as they are."""
+    if system.name == WGS84:
+        return shapes
+    coordinates, owner = shapely.get_coordinates(shapes, include_z=True, return_index=True)
+    coordinates[:, :2] = system.positions(coordinates[:, :2])
+    lifted = shapely.has_z(shapes)[owner]
+    found = shapes.copy()
+    for mask, axes in ((lifted, 3), (~lifted, 2)):
+        rows = np.unique(owner[mask])
+        found[rows] = shapely.set_coordinates(found[rows], coordinates[mask, :axes])
+    return found
+
+
+def _write_styles(path: Path, created: str) -> None:
+    """Write the table in which QGIS looks for the styles of the layers of a GeoPackage."""
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(
+            "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, f_table_catalog TEXT, f_table_schema TEXT, "
+            "f_table_name TEXT, f_geometry_column TEXT, styleName TEXT, styleQML TEXT, styleSLD TEXT, "
+            "useAsDefault BOOLEAN, description TEXT, owner TEXT, ui TEXT, update_time DATETIME)"
+        )
+        database.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, last_change) "
+            "VALUES ('layer_styles', 'attributes', 'layer_styles', ?)",
+            [created],
+        )
+        for layer, style in layer_styles(LINES, CROSSINGS, OBSERVED).items():
+            database.execute(
+                "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
+                "styleName, styleQML, styleSLD, useAsDefault, description, owner, ui, update_time) "
+                "VALUES ('', '', ?, 'geom', 'predmapnet', ?, '', 1, '', '', '', ?)",
+                [layer, style, created],
+            )
+        database.commit()
 
 
 def _heights_text(geometry: Mapping[str, Any]) -> str | None:
     positions = geometry["coordinates"][0] if geometry["type"] == "Polygon" else geometry["coordinates"]
     return json.dumps([height for _, _, height in positions]) if len(positions[0]) == 3 else None
-
-
-def _layers(plain: Path, path: Path, notes: ReadingNotes) -> list[str]:
-    """Return the layers that hold a map; raises ValueError if there is none."""
-    import pyogrio
-
-    found: list[str] = []
-    others: list[str] = []
-    for name, geometry in pyogrio.list_layers(plain):
-        if geometry is None:  # a table without geometries: styles of QGIS and the like
-            continue
-        fields = set(pyogrio.read_info(plain, layer=name)["fields"])
-        (found if "kind" in fields else others).append(str(name))
-    if not found:
-        raise ValueError(f"{path}: not a map of ours: no layer has the column 'kind' (layers: {', '.join(others)})")
-    for name in others:
-        notes.add(f"the layer {name} has no column 'kind': left out")
-    return found
-
-
-def _read_layer(plain: Path, path: Path, layer: str) -> tuple[list[tuple[float, Feature]], Any]:
-    """Return the numbered features of a layer, and the provenance."""
-    import pyogrio
-    from pyogrio import raw
-
-    info = pyogrio.read_info(plain, layer=layer)
-    meta, _, geometry, values = raw.read(plain, layer=layer)
-    to_degrees = ToDegrees(str(info["crs"] or ""), f"{path}, layer {layer}") if len(geometry) else _WGS84
-    columns = dict(zip(meta["fields"].tolist(), values, strict=True))
-    numbers = columns.pop("number", np.full(len(geometry), np.nan))
-    rows = []
-    for place, shape in enumerate(shapely.from_wkb(geometry)):
-        content = {
-            "geometry": None if shape is None else shapely.geometry.mapping(shape),
-            "properties": {name: column[place] for name, column in columns.items()},
-        }
-        number = number_of(numbers[place])
-        rows.append((np.inf if number is None else number, Feature(content, to_degrees)))
-    try:
-        told = json.loads((info.get("layer_metadata") or {}).get(METADATA, "null"))
-    except ValueError:
-        told = None
-    return rows, told
-
-
-_WGS84 = ToDegrees("EPSG:4326", "")
-
-
-@contextmanager
-def driver_errors_told(path: Path) -> Iterator[None]:
-    """Raise what GDAL and GEOS cannot read as ValueErrors that name the file."""
-    import pyogrio.errors
-
-    if not path.is_file():
-        raise FileNotFoundError(2, "No such file or directory", str(path))
-    try:
-        yield
-    except (
-        pyogrio.errors.DataSourceError,
-        pyogrio.errors.DataLayerError,
-        pyogrio.errors.FeatureError,
-        pyogrio.errors.FieldError,
-        shapely.GEOSException,
-        UnicodeDecodeError,
-    ) as error:
-        raise ValueError(f"{path}: cannot be read as a map: {error}") from error
-
-
-@contextmanager
-def plain_path(path: Path) -> Iterator[Path]:
-    """Yield a path to the same file that pyogrio takes as it is: it cuts names at ``!``, ``;`` and ``?``."""
-    if not re.search(r"[!;?]|\.zip$", str(path)):
-        yield path
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        link = Path(folder) / f"map{path.suffix}"
-        link.symlink_to(path.resolve())
-        yield link
 
 
 @contextmanager

@@ -178,6 +178,7 @@ def geometry_of(
 def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any]:
     """Return an element as a GeoJSON feature, which every format writes; raises ValueError off the globe."""
     geometry, turned = geometry_of(element.kind, element.points, georeference, element.heights)
+    length, width = element.extent
     properties: dict[str, Any] = {
         "kind": element.kind.label,
         "confidence": round(element.confidence, 4),
@@ -185,8 +186,10 @@ def feature_of(element: MapElement, georeference: Georeference) -> dict[str, Any
         "first_seen": format_timestamp(element.first_seen),
         "last_seen": format_timestamp(element.last_seen),
         "track_ids": list(element.track_ids),
-        "length_m": round(element.length, 3),
+        "length_m": round(length, 3),
     }
+    if element.kind.is_ring:
+        properties["width_m"] = round(width, 3)
     if element.deviation is not None:
         properties["deviation_m"] = np.round(element.deviation[:: -1 if turned else 1], 3).tolist()
     if element.sources:

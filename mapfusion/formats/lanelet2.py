@@ -147,10 +147,9 @@ def with_right_side_first(element: MapElement) -> tuple[MapElement, int]:
     The sides run along the crossing: between them lie the two edges that are farthest apart along its longer axis. Seen
     along the right side, the crossing lies to the left.
     """
+    element = element.counter_clockwise()
     order = np.arange(len(element.points) - 1)
-    if not shapely.LinearRing(element.points).is_ccw:
-        order = order[::-1]
-    corners = element.points[order]
+    corners = element.points[:-1]
     along = (corners + np.roll(corners, -1, axis=0)) @ _long_axis(element.points)
     first, last = int(np.argmin(along)), int(np.argmax(along))
     corner = (last - first) % len(order)

@@ -10,6 +10,9 @@ import numpy as np
 
 from mapfusion.arrays import Float
 
+BEYOND = 3.0
+"""Degrees beyond the borders of a system's area in which it is used all the same, as UTM is beyond its zones."""
+
 ON_THE_GLOBE = np.array([180.0, 90.0])
 
 
@@ -52,6 +55,49 @@ class ToDegrees:
         if self._transformer is None:
             return list(box)
         return list(self._transformer.transform_bounds(*box))
+
+
+class FromDegrees:
+    """Transformation of longitude and latitude, degrees (WGS84), to a reference system.
+
+    Args:
+        name: of the system: an EPSG code, ``EPSG:32632``.
+
+    Raises:
+        ValueError: PROJ knows no such system, or it is none of places on Earth in two axes.
+    """
+
+    def __init__(self, name: str) -> None:
+        from pyproj import CRS
+        from pyproj.exceptions import CRSError
+
+        self.name = name
+        try:
+            self._system = CRS.from_user_input(name)
+        except CRSError as error:
+            raise ValueError(
+                f"PROJ knows no reference system '{name}'; an EPSG code is expected, EPSG:32632"
+            ) from error
+        if not (self._system.is_projected or self._system.is_geographic) or len(self._system.axis_info) != 2:
+            raise ValueError(f"{name} ({self._system.name}) is no system of places in two axes; take a projected one")
+
+    def positions(self, degrees: Float) -> Float:
+        """Map ``(n, 2)`` degrees to ``(n, 2)`` positions; raises ValueError where the system does not hold."""
+        area = self._system.area_of_use
+        if area is not None and len(degrees):
+            low = np.array([area.west, area.south]) - BEYOND
+            high = np.array([area.east, area.north]) + BEYOND
+            outside = ~((degrees >= low) & (degrees <= high)).all(axis=1)
+            if area.west <= area.east and outside.any():
+                place = degrees[int(np.argmax(outside))]
+                raise ValueError(
+                    f"the map lies at {place[0]:.3f}, {place[1]:.3f} degrees (longitude, latitude), outside the area "
+                    f"of {self.name}: {area.name}"
+                )
+        transformer = _transformer(self.name)
+        if transformer is None:
+            return degrees
+        return np.stack(transformer.transform(degrees[:, 0], degrees[:, 1], direction="INVERSE"), axis=1)
 
 
 @lru_cache(maxsize=16)

@@ -49,13 +49,9 @@ class LineCandidate:
 
 @dataclass(frozen=True)
 class LocalStations:
-    """Stations of all elements of one kind near a frame, end to end.
+    """Stations of all elements of one kind near a frame, end to end, in metres from the box's lower left corner.
 
-    Attributes:
-        elements: ids of the elements.
-        owner: ``(n,)``, which of the elements each station belongs to.
-        row: ``(n,)``, its row in that element.
-        stations: places and directions, metres from the box's lower left corner.
+    ``owner (n,)`` says which of the elements each belongs to, and ``row (n,)`` its row in that element.
     """
 
     elements: Integer
@@ -65,15 +61,7 @@ class LocalStations:
 
 
 def stations_near(lines: Mapping[int, FusedLine], low: Float, high: Float) -> LocalStations | None:
-    """Collect the stations inside a box of the global frame, as coordinates from ``low``.
-
-    Args:
-        lines: elements by id.
-        low, high: ``(2,)``, metres.
-
-    Returns:
-        The stations, or None where there are none.
-    """
+    """Collect the stations inside a box of the global frame, as coordinates from ``low``; None where there are none."""
     if not lines:
         return None
     curves = [line.curve.points for line in lines.values()]
@@ -137,11 +125,7 @@ def line_candidates(
 def best_assignment(benefits: Sequence[Mapping[int, float]]) -> list[int | None]:
     """Give each observation at most one element and each element at most one observation, best in total.
 
-    Args:
-        benefits: per observation, the benefit (> 0) of each element it may belong to.
-
-    Returns:
-        The element of each observation, or None.
+    ``benefits`` hold for each observation the benefit (> 0) of each element it may belong to.
     """
     columns = sorted({element for row in benefits for element in row})
     table = np.zeros((len(benefits), len(columns)))
@@ -195,8 +179,7 @@ class LineMatching:
     def take(self, number: int, chosen: LineCandidate) -> tuple[list[int], list[int]]:
         """Mark the chosen stretch as taken; return the other elements beside the observation.
 
-        Returns:
-            Those that the frame shows, too, and the rest, which may be the same line as the chosen one.
+        First those that the frame shows, too, then the rest, which may be the same line as the chosen one.
         """
         shown: list[int] = []
         twins: list[int] = []
@@ -221,12 +204,9 @@ class LineMatching:
 
 @dataclass(frozen=True)
 class RingCandidates:
-    """Crossings of the map that an observed ring may belong to.
+    """Crossings of the map that an observed ring may belong to: ``overlaps``, intersection over union by their ids.
 
-    Attributes:
-        sighting: the ring on the lattice, with room for itself and all crossings around.
-        low, high: first cell and past the last that the ring itself needs.
-        overlaps: intersection over union by id of the crossing.
+    The sighting has room for the ring, which needs the cells ``low`` to ``high``, and for all of them.
     """
 
     sighting: RingSighting
@@ -242,15 +222,7 @@ def ring_candidates(
     visible: shapely.Geometry | None,
     config: IntegratorConfig,
 ) -> list[RingCandidates]:
-    """Compare the rings of a frame with the crossings of the map near it.
-
-    Args:
-        observations: rings of the frame.
-        rings: crossings near it, by id.
-        frame_map: the frame.
-        visible: ground that could be seen, ego frame; None for all of the ROI.
-        config: of the integrator.
-    """
+    """Compare the rings of a frame with the crossings of the map near it, by id."""
     corners = np.array([ring.corner for ring in rings.values()], dtype=np.int64).reshape(-1, 2)
     stops = np.array([ring.stop for ring in rings.values()], dtype=np.int64).reshape(-1, 2)
     ids = list(rings)

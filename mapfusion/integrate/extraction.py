@@ -11,6 +11,7 @@ from scipy.linalg import solveh_banded
 from scipy.special import expit
 
 from mapfusion.arrays import Bool, Float
+from mapfusion.corners import drawn_outline
 from mapfusion.elements import ElementKind, MapElement
 from mapfusion.geometry import arc_length, simplified_rows
 from mapfusion.integrate.config import IntegratorConfig
@@ -79,7 +80,7 @@ def ring_elements(
     odds = log_odds(np.array([ring.seen]), np.array([np.median(missed)]), config)[0]
     if odds <= 0.0:
         return []
-    points = shapely.get_coordinates(shapely.orient_polygons(shapely.simplify(outline, config.simplify_tolerance)))
+    points = shapely.get_coordinates(shapely.orient_polygons(drawn_outline(outline)))
     cells = np.floor(points / config.ring_cell).astype(np.int64) - ring.corner
     looked = ring.looked[cells[:, 0].clip(0, ring.looked.shape[0] - 1), cells[:, 1].clip(0, ring.looked.shape[1] - 1)]
     deviation = ring_deviations(ring, looked.astype(np.float64), parts, config.common_deviation)
@@ -87,12 +88,9 @@ def ring_elements(
 
 
 def smooth(curve: StationCurve, config: IntegratorConfig) -> Float:
-    """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information).
+    """Smooth a curve as far as its evidence leaves it open (Whittaker's smoother, weighted by information): ``(n, 2)``.
 
     Minimises ``sum information |z - p|² + sum |second difference of z|² / curvature_deviation²``.
-
-    Returns:
-        ``(n, 2) float64``.
     """
     count = len(curve)
     if count < 3:

@@ -17,14 +17,7 @@ JUDGES = 3
 
 @dataclass
 class DriveLog:
-    """Frames of one drive in the order of time.
-
-    Attributes:
-        number: of the drive.
-        times: nanoseconds.
-        positions: of the car, metres, global frame.
-        believed: whether each pose was believed.
-    """
+    """Frames of one drive in the order of time, nanoseconds: positions of the car, metres, and whether believed."""
 
     number: int
     times: list[int] = field(default_factory=list)
@@ -45,20 +38,11 @@ class FrameLog:
         return self.logs[log]
 
     def enter(self, log: str, timestamp: int, position: Float, max_speed: float) -> str | None:
-        """Note a frame and say whether it repeats one, or whether the car can hardly have been there.
+        """Note a frame of a drive; returns what is wrong with it (it repeats one, or cannot be at that place), or None.
 
         The frames around it in time vote, believed ones with two votes: those between which and here a car could
-        have driven against the others. So no frame is beyond doubt. If the first pose of a log is the wrong one, or
-        if a log goes on at another place for good, two frames are refused and the rest is believed.
-
-        Args:
-            log: name of the drive.
-            timestamp: nanoseconds.
-            position: ``(2,)``, metres, global frame.
-            max_speed: metres per second.
-
-        Returns:
-            What is wrong with the frame, or None.
+        have driven (at ``max_speed``, m/s) against the others. So no frame is beyond doubt. If the first pose of a
+        log is the wrong one, or if a log goes on elsewhere for good, two frames are refused and the rest is believed.
         """
         drive = self.drive(log)
         place = bisect_left(drive.times, timestamp)

@@ -41,15 +41,11 @@ class FusedLine:
 
 
 def fuse(line: FusedLine, new: StationCurve, match: Correspondence) -> list[StationCurve]:
-    """Fuse a curve into a line that it lies beside, in place.
+    """Fuse a curve (an observation, or another line of the map) into a line that it lies beside, in place.
 
     Where both lie side by side, each station moves across the line to the mean weighted by information. Where the
-    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch.
-
-    Args:
-        line: of the map.
-        new: an observation, or the curve of another line of the map.
-        match: stations of the line (at least one) beside vertices of ``new``.
+    new curve goes on past an end of the line, the line is extended, led over smoothly from the fused stretch. The
+    match has at least one station.
 
     Returns:
         The parts of ``new`` that leave the line sideways and belong to another line.
@@ -105,11 +101,8 @@ def _average(base: StationCurve, new: StationCurve, match: Correspondence, verte
 def _extension(part: StationCurve, foot: Float, shift: Float, base: Float) -> StationCurve:
     """Return a part led over from the base's end, up to where it comes back to the base (a closed loop).
 
-    Args:
-        part: vertices past the end, nearest first.
-        foot: ``(2,)``, where the base's end falls on the unshifted curve.
-        shift: ``(2,)``, from there to the fused end.
-        base: ``(n, 2)`` stations of the base.
+    Its vertices past the end come nearest first; ``foot`` is where the base's end falls on the unshifted curve, and
+    ``shift`` leads from there to the fused end.
     """
     at_start = squared(base[0] - foot) < squared(base[-1] - foot)
     end = base[0] if at_start else base[-1]

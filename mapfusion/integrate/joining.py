@@ -34,12 +34,9 @@ ONE_VERTEX = 0.3
 
 @dataclass(frozen=True)
 class Link:
-    """Link of two ends that may be one line.
+    """Link of two ends that may be one line; the least cost (metres apart, more where they miss each other) is first.
 
-    Attributes:
-        cost: metres apart, and more where they do not point at each other; the least comes first.
-        ends: of the two elements.
-        overlap: how far the second one reaches back beside the first, metres.
+    ``overlap`` is how far the second one reaches back beside the first, metres.
     """
 
     cost: float
@@ -49,14 +46,9 @@ class Link:
 
 @dataclass(frozen=True)
 class Ends:
-    """Ends of elements, as arrays of equal length; crossings and closed lines have none.
+    """Ends of elements (0 the start, -1 the end), as arrays of equal length; crossings and closed lines have none.
 
-    Attributes:
-        element: ``(n,) int64``, which element.
-        end: ``(n,) int64``, 0 for its start, -1 for its end.
-        kind: ``(n,) int64``.
-        tip: ``(n, 2) float64``, metres.
-        outward: ``(n, 2) float64``, unit, the direction that leads out of it.
+    ``tip (n, 2)``, metres, is where each lies, and ``outward (n, 2)`` the unit direction that leads out of it.
     """
 
     element: Integer
@@ -138,11 +130,7 @@ def links_between(elements: Sequence[MapElement], ends: Ends, views: ViewGrid, c
 
 
 def joined_along(elements: Sequence[MapElement], links: Sequence[Link]) -> list[tuple[int, MapElement]]:
-    """Join along links, each end once, in their order.
-
-    Returns:
-        The least number in each joined element, ascending, and the element.
-    """
+    """Join along links, each end once, in their order: the least number in each joined element, ascending, and it."""
 
     def join(before: MapElement, after: MapElement, number: int) -> MapElement:
         return _joined(before, after, links[number].overlap)

@@ -12,12 +12,7 @@ from mapfusion.arrays import Bool, Float, Integer, Rows
 
 
 class DirectedPoints(NamedTuple):
-    """Points of curves with the directions of the curves there.
-
-    Attributes:
-        points: ``(n, 2) float64``, metres.
-        directions: ``(n, 2) float64``, unit.
-    """
+    """Points ``(n, 2)`` of curves, metres, with the unit directions of the curves there."""
 
     points: Float
     directions: Float
@@ -28,12 +23,9 @@ class DirectedPoints(NamedTuple):
 
 
 class MatchLimits(NamedTuple):
-    """Limits within which a station lies beside a curve.
+    """Limits within which a station lies beside a curve: lateral distance (metres) and angle (degrees).
 
-    Attributes:
-        reach: largest lateral distance, metres.
-        angle: largest angle between the directions, degrees.
-        end: how far past the first or last vertex a foot may lie, metres.
+    ``end`` is how far past the first or last vertex a foot may lie, metres.
     """
 
     reach: float
@@ -123,13 +115,9 @@ def correspond(stations: DirectedPoints, owner: Integer, curve: DirectedPoints, 
 
 
 class _Pairs(NamedTuple):
-    """Pairs of a station and a vertex, all with all.
+    """Pairs of ``n`` stations and the ``m`` vertices of a curve, all with all, ``(n, m)``.
 
-    Attributes:
-        stations: ``n`` of them.
-        curve: its ``m`` vertices.
-        square: ``(n, m)``, rises with the distance between station and vertex.
-        cosine: ``(n, m)``, of the angle between their directions.
+    ``square`` rises with their distance, ``cosine`` is that of the angle between their directions.
     """
 
     stations: DirectedPoints
@@ -146,13 +134,9 @@ class _Pairs(NamedTuple):
 
 
 class _Feet(NamedTuple):
-    """Feet of stations on a curve, as arrays of equal length.
+    """Feet of stations: the nearest vertex, the offset ``(n, 2)`` across to the curve and its length, metres.
 
-    Attributes:
-        vertex: nearest vertex.
-        offset: ``(n, 2)``, metres, from the station across to the curve.
-        distance: length of the offset, metres.
-        beside: whether the station lies within the limits.
+    ``beside`` says whether the station lies within the limits.
     """
 
     vertex: Integer
@@ -173,11 +157,8 @@ class _Feet(NamedTuple):
 def _feet(pairs: _Pairs, square: Float, ahead: Bool, limits: MatchLimits) -> _Feet:
     """Find the foot of each station.
 
-    Args:
-        pairs: of stations and vertices.
-        square: ``(n, m)``, rises with the distance; infinite for vertices that are no choice.
-        ahead: ``(n,)``, whether the station must run along the curve or against it.
-        limits: of a match.
+    ``square (n, m)`` rises with the distance and is infinite for vertices that are no choice; ``ahead (n,)`` says
+    whether the station must run along the curve or against it.
     """
     curve = pairs.curve
     vertex = square.argmin(axis=1)

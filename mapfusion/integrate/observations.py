@@ -58,7 +58,7 @@ def observe(
     log: int = 0,
     visible: shapely.Geometry | None = None,
 ) -> tuple[list[Observation], list[Observation]]:
-    """Return the lines and the rings of a frame that can be fused.
+    """Return the lines (clipped to the ROI, resampled) and the rings of a frame that can be fused.
 
     Args:
         frame_map: one instant; only tracked elements are used.
@@ -66,9 +66,6 @@ def observe(
         rejections: counted up by reason for every element that is left out.
         log: number of the drive.
         visible: what could be seen, ego frame; None for all of the ROI.
-
-    Returns:
-        Lines (clipped to the ROI, resampled) and rings.
     """
     half = frame_map.roi.size / 2
     box = shapely.box(*-half, *half)
@@ -213,8 +210,7 @@ def _ring_parts(points: Float, box: shapely.Polygon, within: bool) -> list[Float
 def _stations(lines: list[Float], spacing: float) -> dict[int, Float]:
     """Resample lines ``(k, 2)`` about every ``spacing`` metres, both ends included, all at once.
 
-    Returns:
-        Stations by number of the line; those without length are missing.
+    Returns stations by number of the line; those without length are missing.
     """
     if not lines:
         return {}

@@ -61,11 +61,7 @@ class IntegratorState:
 
 
 def save_state(state: IntegratorState, path: Path) -> None:
-    """Write the state of an integrator; the file appears complete or not at all.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the state of an integrator; the file appears complete or not at all. Raises OSError."""
     lines, rings, tiles = state.lines, state.rings, state.views.tiles
     curves = [line.curve for line in lines.values()]
     header = {
@@ -115,12 +111,7 @@ def save_state(state: IntegratorState, path: Path) -> None:
 
 
 def load_state(path: Path) -> IntegratorState:
-    """Read the state that :func:`save_state` wrote.
-
-    Raises:
-        ValueError: not such a file.
-        OSError: the file cannot be read.
-    """
+    """Read the state that :func:`save_state` wrote; raises ValueError for other files, OSError."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

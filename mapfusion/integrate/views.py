@@ -35,16 +35,9 @@ def clearly_visible(frame_map: FrameMap) -> shapely.Geometry | None:
 def view_weight(
     points_ego: Float, roi: RegionOfInterest, config: IntegratorConfig, visible: shapely.Geometry | None = None
 ) -> Float:
-    """Return the weight of a missing detection at each point.
+    """Return the weight of a missing detection, 0 to 1, at points ``(..., 2)``, metres, ego frame.
 
-    Args:
-        points_ego: ``(..., 2)``, metres, ego frame.
-        roi: the region that was looked at.
-        config: rim and ranges.
-        visible: what of it could be seen, ego frame; None for all.
-
-    Returns:
-        ``(...) float64`` in ``[0, 1]``; 0 outside the ROI, at its rim, and where nothing could be seen.
+    It is 0 outside the ROI, at its rim, and where nothing could be seen (outside ``visible``; None for no such place).
     """
     x, y = points_ego[..., 0], points_ego[..., 1]
     inside = (np.abs(x) < roi.length / 2 - config.rim) & (np.abs(y) < roi.width / 2 - config.rim)
@@ -65,13 +58,7 @@ class ViewGrid:
         self.tiles: dict[TileKey, NDArray[np.float32]] = {}
 
     def add(self, ego_to_global: Float, roi: RegionOfInterest, visible: shapely.Geometry | None = None) -> None:
-        """Count one frame.
-
-        Args:
-            ego_to_global: ``(4, 4)``.
-            roi: the region that was looked at.
-            visible: what of it could be seen, ego frame; None for all.
-        """
+        """Count one frame that looked at a region, of which ``visible`` (ego frame; None for all) could be seen."""
         rotation, origin = ego_to_global[:2, :2], ego_to_global[:2, 3]
         reach = np.abs(rotation) @ (roi.size / 2)
         low = np.floor(origin - reach).astype(int)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -32,9 +32,9 @@ class Correction:
         turn: radians.
     """
 
-    centre: Float
-    shift: Float
-    turn: float
+    centre: Float = field(default_factory=lambda: np.zeros(2))
+    shift: Float = field(default_factory=lambda: np.zeros(2))
+    turn: float = 0.0
 
     def apply(self, points: Float) -> Float:
         """Move points ``(n, 2)``."""
@@ -57,7 +57,7 @@ def solve_corrections(centres: Float, pairs: Mapping[tuple[int, int], Alignment]
     """
     count = len(centres)
     if not pairs:
-        return [Correction(centre, np.zeros(2), 0.0) for centre in centres]
+        return [Correction()] * count
     keys = sorted(pairs)
     blocks = [_block(centres, key, pairs[key]) for key in keys]
     trust = np.ones(len(keys))

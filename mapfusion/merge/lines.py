@@ -77,15 +77,9 @@ class _References:
 
 
 def fuse_lines(kind: ElementKind, contributions: Sequence[Contribution], config: MergeConfig) -> list[MergedLine]:
-    """Fuse the lines of one kind of several maps of one place.
+    """Fuse the dividers or boundaries of several maps of one place: those lines that more likely exist than not.
 
-    Args:
-        kind: dividers or boundaries.
-        contributions: one per map, in an order that does not depend on how the maps were given.
-        config: what is assumed.
-
-    Returns:
-        The lines of which it is more likely than not that they exist.
+    The contributions, one per map, come in an order that does not depend on how the maps were given.
     """
     references = _References()
     hits = [_contribute(references, kind, contribution, config) for contribution in contributions]

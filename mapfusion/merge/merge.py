@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
 from scipy.special import expit
 
-from mapfusion.alignment import Alignment, Landmarks, align, landmarks
+from mapfusion.alignment import Alignment, align
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.by_suffix import MapWriter, check_frames, frame_of, read_box, read_map
+from mapfusion.executors import Executor, Sequential, results_in_order
+from mapfusion.formats.by_suffix import MapWriter, check_frames, frame_of, read_box
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.geometry import arc_length, simplified_rows
 from mapfusion.georeference import InvertibleGeoreference
-from mapfusion.ground import coverage, ground_within, rings_around
+from mapfusion.ground import ground_within, rings_around
 from mapfusion.line_repair import repaired_rows
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.corrections import Correction, solve_corrections
+from mapfusion.merge.map_cache import MapCache
 from mapfusion.merge.report import MapStatus, MergeReport, notes_of_copies, short_names
 from mapfusion.merge.tile_fusion import fuse_tile, named
 from mapfusion.merge.tiles import MergedLine, Stitcher, Tile, tiles_of
@@ -35,8 +34,12 @@ from mapfusion.road_heights import filled, rises
 Progress = Callable[[int, int, str], None]
 """Called as ``progress(done, in all, what)``."""
 
-CACHED_MAPS = 48
-"""Number of maps held in memory at a time; neighbouring tiles need the same ones."""
+NEIGHBOURS = 4
+"""Number of neighbouring tasks that one worker does one after the other, since they need the same maps."""
+
+_Task = TypeVar("_Task")
+_FusedTile = tuple[list[MergedLine], list[MapElement]]
+"""Lines of a tile, cut at its sides, and its crossings."""
 
 
 @dataclass(frozen=True)
@@ -59,54 +62,32 @@ class _MapSummary:
         return (self.low + self.high) / 2
 
 
-class _MapCache:
-    """Cache of maps that are read when they are needed."""
+@dataclass(frozen=True)
+class _Aligning:
+    """Work of the alignment: called in a worker, it opens the maps and returns what aligns some of them with others."""
 
-    def __init__(self, maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None) -> None:
-        self.maps = maps
-        self.plane = plane
-        self.corrections: dict[int, Correction] = {}
-        self.raw = lru_cache(CACHED_MAPS)(self._raw)
-        self.landmarks = lru_cache(CACHED_MAPS)(self._landmarks)
-        self.corrected = lru_cache(CACHED_MAPS)(self._corrected)
+    maps: Sequence[GlobalMap] | Sequence[Path]
+    plane: InvertibleGeoreference | None
 
-    def _raw(self, place: int) -> GlobalMap:
-        item = self.maps[place]
-        return read_map(item, self.plane) if isinstance(item, Path) else item
-
-    def _landmarks(self, place: int) -> Landmarks:
-        return landmarks(self._raw(place))
-
-    def _corrected(self, place: int) -> tuple[GlobalMap, shapely.Geometry]:
-        """Return a map and its ground, both corrected."""
-        raw = self._raw(place)
-        ground = coverage(raw, self.plane)
-        correction = self.corrections.get(place)
-        if correction is None:
-            return raw, ground
-        return raw.moved(correction.apply), shapely.transform(ground, correction.apply)
+    def __call__(self) -> Callable[[Sequence[tuple[int, list[int]]]], list[tuple[int, int, Alignment]]]:
+        cache = MapCache(self.maps, self.plane)
+        return lambda tasks: [found for task in tasks for found in _align_with(cache, *task)]
 
 
-_cache: _MapCache
-"""Cache of a worker process."""
+@dataclass(frozen=True)
+class _Fusing:
+    """Work of the fusion: called in a worker, it opens the maps and returns what fuses tile after tile."""
 
+    maps: Sequence[GlobalMap] | Sequence[Path]
+    plane: InvertibleGeoreference | None
+    corrections: dict[int, Correction]
+    names: list[str]
+    config: MergeConfig
 
-def _start_worker(
-    maps: Sequence[GlobalMap] | Sequence[Path], plane: InvertibleGeoreference | None, corrections: dict[int, Correction]
-) -> None:
-    global _cache
-    _cache = _MapCache(maps, plane)
-    _cache.corrections = corrections
-
-
-def _align_in_worker(task: tuple[int, list[int]]) -> list[tuple[int, int, Alignment]]:
-    return _align_with(_cache, *task)
-
-
-def _fuse_in_worker(
-    task: tuple[Tile, list[int], Sequence[str], MergeConfig],
-) -> tuple[list[MergedLine], list[MapElement]]:
-    return _fuse_tile(_cache, *task)
+    def __call__(self) -> Callable[[Sequence[tuple[Tile, list[int]]]], list[_FusedTile]]:
+        cache = MapCache(self.maps, self.plane)
+        cache.corrections = self.corrections
+        return lambda tasks: [_fuse_tile(cache, tile, places, self.names, self.config) for tile, places in tasks]
 
 
 def merge_maps(
@@ -130,8 +111,8 @@ def merge_maps(
         And the report on the maps.
     """
     names = list(names) if names is not None else [f"map {i}" for i in range(len(maps))]
-    merge = _Merge(_MapCache(maps, plane), names, config or MergeConfig())
-    elements = tuple(merge.elements(1, None))
+    merge = _Merge(MapCache(maps, plane), names, config or MergeConfig())
+    elements = tuple(merge.elements(Sequential(), None))
     return GlobalMap(elements, {"sources": sorted(names)}), merge.report()
 
 
@@ -139,9 +120,10 @@ def merge_files(
     paths: Sequence[Path],
     out: Path,
     config: MergeConfig | None = None,
-    jobs: int = 1,
+    executor: Executor | None = None,
     progress: Progress | None = None,
     provenance: dict[str, Any] | None = None,
+    crs: str | None = None,
 ) -> MergeReport:
     """Merge map files of one city into one file; what is held in memory depends on the tiles, not on the city.
 
@@ -149,9 +131,10 @@ def merge_files(
         paths: maps to merge.
         out: file to write; a GeoJSON file is written as the tiles are done, other formats at the end.
         config: what is assumed.
-        jobs: processes.
+        executor: aligns and fuses; everything is done here, one after the other, without.
         progress: called as the work goes on.
         provenance: what else the file should tell of its origin.
+        crs: reference system of the file, as of :func:`mapfusion.formats.by_suffix.write_map`.
 
     Raises:
         ValueError: a file that is not a map, maps that lie too far apart, or two maps of the same name.
@@ -160,13 +143,13 @@ def merge_files(
     boxes = [box for box in (read_box(path) for path in paths) if box is not None]
     plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
     names = short_names(paths)
-    merge = _Merge(_MapCache(list(paths), plane), names, config or MergeConfig())
+    merge = _Merge(MapCache(list(paths), plane), names, config or MergeConfig())
     told = {**merge.provenance, "generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
     observed = merge.observed()
     if observed is not None:
         told["observed"] = observed
-    with MapWriter(out, plane, told) as writer:
-        for element in merge.elements(jobs, progress):
+    with MapWriter(out, plane, told, crs) as writer:
+        for element in merge.elements(executor or Sequential(), progress):
             writer.write(element)
     return merge.report()
 
@@ -174,7 +157,7 @@ def merge_files(
 class _Merge:
     """One merge, from the maps to the elements of the result."""
 
-    def __init__(self, cache: _MapCache, names: Sequence[str], config: MergeConfig) -> None:
+    def __init__(self, cache: MapCache, names: Sequence[str], config: MergeConfig) -> None:
         self.cache = cache
         self.config = config
         looked = [(_summary(cache, i, name), cache.raw(i).provenance) for i, name in enumerate(names)]
@@ -191,7 +174,7 @@ class _Merge:
         check_frames((entry.name, entry.frame) for entry in entries)
         self.empty = sorted(set(names) - {entry.name for entry in entries})
         self.names = list(names)
-        self.statuses: list[MapStatus] = [MapStatus(name, 0.0, 0.0, 0, "the map is empty") for name in self.empty]
+        self.statuses: list[MapStatus] = [MapStatus(name, Correction(), 0, "the map is empty") for name in self.empty]
         self.counts = {kind.label: 0 for kind in ElementKind}
         self.metres = {kind.label: 0.0 for kind in ElementKind}
         self.tile_count = 0
@@ -203,12 +186,12 @@ class _Merge:
         grounds = [ground_within([np.array(ring) for ring in entry.observed or ()]) for entry in self.entries]
         return [np.round(ring, 7).tolist() for ring in rings_around(shapely.union_all(grounds))]
 
-    def elements(self, jobs: int, progress: Progress | None) -> Iterator[MapElement]:
+    def elements(self, executor: Executor, progress: Progress | None) -> Iterator[MapElement]:
         """Correct the poses, then yield the elements of the result in the order of the tiles."""
         say = progress or (lambda done, total, what: None)
-        apart = self._correct(jobs, say)
+        apart = self._correct(executor, say)
         fused = [entry for entry in self.entries if entry.place not in apart]
-        for element in self._fused(fused, jobs, say):
+        for element in self._fused(fused, executor, say):
             yield self._counted(element)
         for entry in self.entries:
             if entry.place in apart:
@@ -222,15 +205,18 @@ class _Merge:
 
     def _counted(self, element: MapElement) -> MapElement:
         self.counts[element.kind.label] += 1
-        self.metres[element.kind.label] += element.length
+        self.metres[element.kind.label] += element.extent[0]
         return element
 
-    def _correct(self, jobs: int, say: Progress) -> set[int]:
+    def _correct(self, executor: Executor, say: Progress) -> set[int]:
         """Align the maps with each other; returns those that contradict the others."""
         tasks = _partners(self.entries, self.config.max_partners)
         found: dict[tuple[int, int], Alignment] = {}
-        for done, row in enumerate(self._each(_align_with, _align_in_worker, tasks, jobs), start=1):
+        groups, done = _groups(tasks), 0
+        aligning = _Aligning(self.cache.maps, self.cache.plane)
+        for group, row in zip(groups, results_in_order(executor, aligning, groups), strict=True):
             found.update({(first, second): alignment for first, second, alignment in row})
+            done += len(group)
             say(done, len(tasks), "aligning")
         number = {entry.place: i for i, entry in enumerate(self.entries)}
         certain = {(number[a], number[b]): alignment for (a, b), alignment in found.items() if alignment.certain}
@@ -250,11 +236,10 @@ class _Merge:
                 apart.add(entry.place)
             if partners:
                 self.cache.corrections[entry.place] = correction
-            shift, turn = float(np.linalg.norm(correction.shift)), float(np.degrees(correction.turn))
-            self.statuses.append(MapStatus(entry.name, shift, turn, partners, note, contradicts))
+            self.statuses.append(MapStatus(entry.name, correction, partners, note, contradicts))
         return apart
 
-    def _fused(self, entries: list[_MapSummary], jobs: int, say: Progress) -> Iterator[MapElement]:
+    def _fused(self, entries: list[_MapSummary], executor: Executor, say: Progress) -> Iterator[MapElement]:
         reach = self.config.margin + 6.0
         members: dict[Tile, list[int]] = {}
         for entry in entries:
@@ -263,8 +248,9 @@ class _Merge:
         tiles = sorted(members)
         self.tile_count = len(tiles)
         stitcher = Stitcher(tiles)
-        tasks = [(tile, members[tile], self.names, self.config) for tile in tiles]
-        results = self._each(_fuse_tile, _fuse_in_worker, tasks, jobs)
+        groups = _groups([(tile, members[tile]) for tile in tiles])
+        fusing = _Fusing(self.cache.maps, self.cache.plane, self.cache.corrections, self.names, self.config)
+        results = (fused for group in results_in_order(executor, fusing, groups) for fused in group)
         for done, (tile, (lines, rings)) in enumerate(zip(tiles, results, strict=True), start=1):
             for line in stitcher.add(tile, lines):
                 yield from self._finished(line)
@@ -296,17 +282,12 @@ class _Merge:
         )
         yield element.with_origins(line.origins)
 
-    def _each(self, direct: Any, in_worker: Any, tasks: Sequence[Any], jobs: int) -> Iterator[Any]:
-        """Do the tasks here or in processes, results in order."""
-        if jobs <= 1 or len(tasks) < 2:
-            yield from (direct(self.cache, *task) for task in tasks)
-            return
-        cache = (self.cache.maps, self.cache.plane, self.cache.corrections)
-        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_start_worker, initargs=cache) as pool:
-            yield from pool.map(in_worker, tasks, chunksize=4)
+
+def _groups(tasks: list[_Task]) -> list[list[_Task]]:
+    return [tasks[first : first + NEIGHBOURS] for first in range(0, len(tasks), NEIGHBOURS)]
 
 
-def _summary(cache: _MapCache, place: int, name: str) -> _MapSummary | None:
+def _summary(cache: MapCache, place: int, name: str) -> _MapSummary | None:
     """Look at a map once, before anything is merged; None for an empty one."""
     raw = cache.raw(place)
     if not len(raw):
@@ -345,14 +326,14 @@ def _partners(entries: Sequence[_MapSummary], most: int) -> list[tuple[int, list
     return sorted((task for task in tasks if task[1]), key=lambda task: spot[task[0]])
 
 
-def _align_with(cache: _MapCache, place: int, others: Sequence[int]) -> list[tuple[int, int, Alignment]]:
+def _align_with(cache: MapCache, place: int, others: Sequence[int]) -> list[tuple[int, int, Alignment]]:
     """Align one map with each of several others."""
     source = cache.landmarks(place)
     return [(place, other, align(source, cache.landmarks(other))) for other in others]
 
 
 def _fuse_tile(
-    cache: _MapCache, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
-) -> tuple[list[MergedLine], list[MapElement]]:
+    cache: MapCache, tile: Tile, places: Sequence[int], names: Sequence[str], config: MergeConfig
+) -> _FusedTile:
     """Fuse what the maps have in a tile."""
     return fuse_tile(tile, [(names[place], place, *cache.corrected(place)) for place in places], config)

@@ -6,6 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from mapfusion.merge.corrections import Correction
+
 
 @dataclass(frozen=True)
 class MapStatus:
@@ -13,19 +17,22 @@ class MapStatus:
 
     Attributes:
         name: of the map.
-        shift: how far it was moved, metres.
-        turn: and turned, degrees.
+        correction: how its poses were corrected.
         partners: how many others it was aligned with.
         note: why it was not aligned, empty if it was.
         apart: True for a map that contradicts the others: its elements are in the result as they are, not fused.
     """
 
     name: str
-    shift: float
-    turn: float
+    correction: Correction
     partners: int
     note: str = ""
     apart: bool = False
+
+    @property
+    def shift(self) -> float:
+        """How far it was moved, metres."""
+        return float(np.linalg.norm(self.correction.shift))
 
 
 @dataclass(frozen=True)
@@ -51,10 +58,7 @@ class MergeReport:
 def short_names(paths: Sequence[Path]) -> list[str]:
     """Return names of files: their stems, with as many folders before as it takes to tell them apart.
 
-    The same map in two formats is told apart by the endings.
-
-    Raises:
-        ValueError: the same file is given twice.
+    The same map in two formats is told apart by the endings; ValueError if the same file is given twice.
     """
     deepest = max((len(path.parts) for path in paths), default=0)
     names: list[str] = []
@@ -72,8 +76,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 def notes_of_copies(maps: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:
     """Return a note for each map that is an edited copy of another.
 
-    Args:
-        maps: names, and digests of what the maps say of their making, the moment included.
+    The maps are names and digests of what they say of their making, the moment included.
     """
     first: dict[str, str] = {}
     notes = []

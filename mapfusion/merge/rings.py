@@ -10,6 +10,7 @@ import shapely
 from scipy.special import expit
 
 from mapfusion.arrays import Float
+from mapfusion.corners import drawn_outline
 from mapfusion.elements import MapElement, united_origins
 from mapfusion.formats.identities import element_name
 from mapfusion.merge.config import MergeConfig
@@ -31,14 +32,9 @@ class _Cluster:
 
 
 def fuse_rings(contributions: Sequence[Contribution], config: MergeConfig) -> list[MapElement]:
-    """Fuse the crossings of several maps of one place.
+    """Fuse the crossings of several maps of one place: those that more likely exist than not.
 
-    Args:
-        contributions: one per map, in an order that does not depend on how the maps were given.
-        config: what is assumed.
-
-    Returns:
-        The crossings of which it is more likely than not that they exist.
+    The contributions, one per map, come in an order that does not depend on how the maps were given.
     """
     clusters: list[_Cluster] = []
     for contribution in contributions:
@@ -101,8 +97,7 @@ def _outline(cluster: _Cluster, config: MergeConfig) -> Float | None:
     if not polygons:
         return None
     outline = shapely.get_coordinates(polygons[0]) * CELL + low + 0.5 * CELL
-    simple = shapely.simplify(shapely.Polygon(outline), config.simplify_tolerance)
-    fused: Float = shapely.get_coordinates(shapely.orient_polygons(simple))
+    fused: Float = shapely.get_coordinates(shapely.orient_polygons(drawn_outline(shapely.Polygon(outline))))
     return fused
 
 

@@ -23,10 +23,7 @@ def fuse_tile(
 ) -> tuple[list[MergedLine], list[MapElement]]:
     """Fuse what the maps have in a tile and its margin; return the lines, cut at its sides, and its crossings.
 
-    Args:
-        tile: of the plane.
-        maps: name and number of each, its elements and the ground that it speaks of, metres.
-        config: what is assumed.
+    Of each map there are the name, the number, the elements and the ground that it speaks of, metres.
     """
     low, high = tile.low - config.margin, tile.high + config.margin
     looks = [Looks(part for element in found for part in _in_box(element, low, high)) for _, _, found, _ in maps]

@@ -67,15 +67,9 @@ def tiles_of(low: Float, high: Float, side: float) -> list[Tile]:
 
 
 def cut_line(points: Float, values: Float, low: Float, high: Float) -> list[tuple[Float, Float]]:
-    """Return the parts of a line inside a box.
+    """Return the parts of a line ``(n, 2)`` inside a box, in its order, and of the values ``(n, k)`` along it.
 
-    Args:
-        points: ``(n, 2)``, metres.
-        values: ``(n, k)``, anything that is interpolated along the line.
-        low, high: corners of the box; a line along the upper sides belongs to the next box.
-
-    Returns:
-        Pairs of points and values, in the order of the line; ends lie exactly on the box's sides.
+    Ends lie exactly on the box's sides; a line along the upper sides belongs to the next box.
     """
     inside = ((points >= low) & (points < high)).all(axis=1)
     if inside.all():

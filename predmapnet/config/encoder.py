@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, Tag
+from pydantic import Field, Tag, model_validator
 
-from predmapnet.config.section import Distances, Fraction, Metres, Positive, Section, kind_of
+from predmapnet.config.section import (
+    AttentionSection,
+    Distances,
+    Fraction,
+    Metres,
+    Positive,
+    Quirks,
+    Section,
+    kind_of,
+)
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
-
-PILLAR_SAMPLES = 8
-"""Samples of each head per camera and image level (BEVFormer); they take the points of a pillar in turns."""
 
 
 class ImageWindowConfig(Section):
@@ -52,92 +58,16 @@ class WholeImageConfig(Section):
 ImageConfig = Annotated[
     Annotated[ImageWindowConfig, Tag("window")] | Annotated[WholeImageConfig, Tag("whole")], kind_of("window")
 ]
-"""What the network sees of each camera."""
+"""Part of each image that the network sees, and its size."""
 
 
 class SmallBackboneConfig(Section):
     """A small residual network with a feature pyramid to stride 4."""
 
-    kind: Literal["small"] = "small"
     stem: tuple[Positive, Positive] = (16, 32)
     widths: tuple[Positive, Positive, Positive] = (32, 48, 96)
     blocks: tuple[Positive, Positive, Positive] = (1, 2, 2)
     channels: Positive = 32
-
-
-class ResNet50Config(Section):
-    """ResNet-50 with deformable convolutions, and a feature pyramid at strides 8, 16 and 32.
-
-    Attributes:
-        channels: of each level of the pyramid.
-    """
-
-    kind: Literal["resnet50"] = "resnet50"
-    channels: Positive = 256
-
-
-BackboneConfig = Annotated[
-    Annotated[SmallBackboneConfig, Tag("small")] | Annotated[ResNet50Config, Tag("resnet50")], kind_of("small")
-]
-"""What makes features of the images."""
-
-
-class LookupBevConfig(Section):
-    """A look-up of the image features on the ground, then a U-Net.
-
-    On the road, the look-up finds twice as many cells in each direction as the grid has.
-
-    Attributes:
-        rows: of the BEV grid, along y.
-        columns: of the BEV grid, along x.
-        widths: channels of the three BEV levels, fine to coarse.
-        further_heights: metres above the road at which each cell of the grid looks into the images once more, for
-            roads that are not flat.
-    """
-
-    kind: Literal["lookup"] = "lookup"
-    rows: Positive = 50
-    columns: Positive = 100
-    widths: tuple[Positive, Positive, Positive] = (48, 80, 128)
-    further_heights: tuple[float, ...] = ()
-
-
-class BevFormerConfig(Section):
-    """Learned queries of the ground cells that look into the images (BEVFormer), past BEV maps included.
-
-    Attributes:
-        rows: of the BEV grid, along y.
-        columns: of the BEV grid, along x.
-        width: channels of the BEV features.
-        cameras: their names; each has a learned code, so that a rig is put into this order.
-        pillar_low: lowest of the heights at which a cell looks into the images, metres in the ego frame.
-        pillar_high: highest of them.
-        pillar_points: number of heights.
-    """
-
-    kind: Literal["bevformer"] = "bevformer"
-    rows: Positive = 50
-    columns: Positive = 100
-    width: Positive = 256
-    heads: Positive = 8
-    layers: Positive = 2
-    hidden: Positive = 512
-    dropout: Fraction = 0.1
-    cameras: Annotated[tuple[str, ...], Field(min_length=1)] = NUSCENES_CAMERAS
-    pillar_low: float = -2.5
-    pillar_high: float = 4.5
-    pillar_points: Positive = 4
-
-    @property
-    def widths(self) -> tuple[int, int, int]:
-        """Channels of the three BEV levels, fine to coarse."""
-        return self.width, self.width, self.width
-
-
-BevConfig = Annotated[
-    Annotated[LookupBevConfig, Tag("lookup")] | Annotated[BevFormerConfig, Tag("bevformer")], kind_of("lookup")
-]
-"""The BEV grid (``rows`` x ``columns`` cells of ``H x W``) and what fills it."""
 
 
 class ResidualBevMemoryConfig(Section):
@@ -151,7 +81,6 @@ class ResidualBevMemoryConfig(Section):
         spacing: the newest map is replaced until the car has moved this far, metres.
     """
 
-    kind: Literal["residual"] = "residual"
     enabled: bool = True
     channels: Positive = 16
     distances: Distances = (1.0, 5.0, 10.0, 15.0)
@@ -162,28 +91,105 @@ class ResidualBevMemoryConfig(Section):
 class EncoderBevMemoryConfig(Section):
     """Past BEV maps enter the BEV encoder after each of its layers (MapTracker's BEV memory fusion).
 
-    Attributes:
-        distances: metres back at which maps are chosen.
-        capacity: frames that are remembered.
+    Of the last ``capacity`` frames, those are chosen that lie about so many metres back.
     """
 
-    kind: Literal["encoder"] = "encoder"
     distances: Distances = (1.0, 5.0, 10.0, 15.0)
     capacity: Positive = 20
 
 
-BevMemoryConfig = Annotated[
-    Annotated[ResidualBevMemoryConfig, Tag("residual")] | Annotated[EncoderBevMemoryConfig, Tag("encoder")],
-    kind_of("residual"),
+class LookupBevConfig(Section):
+    """A small image backbone, a look-up of its features on the ground, and a U-Net.
+
+    On the road, the look-up finds twice as many cells in each direction as the grid has.
+
+    Attributes:
+        rows: of the BEV grid, along y.
+        columns: of the BEV grid, along x.
+        widths: channels of the three BEV levels, fine to coarse.
+        further_heights: metres above the road at which each cell of the grid looks into the images once more, for
+            roads that are not flat.
+        mask_stride: cells of the grid per cell of the instance masks.
+    """
+
+    kind: Literal["lookup"] = "lookup"
+    rows: Positive = 50
+    columns: Positive = 100
+    widths: tuple[Positive, Positive, Positive] = (48, 80, 128)
+    further_heights: tuple[float, ...] = ()
+    backbone: SmallBackboneConfig = SmallBackboneConfig()
+    memory: ResidualBevMemoryConfig = ResidualBevMemoryConfig()
+    mask_stride: Literal[1, 2] = 2
+
+
+class EncoderQuirks(Quirks):
+    """Oddities of the BEV encoder of the official MapTracker.
+
+    Attributes:
+        mirrored_self_attention: the BEV self-attention looks around the cell mirrored in y, since its reference
+            points count rows from the right-hand side while the map counts them from the left.
+        propagate_where_sum_is_positive: a warped history cell replaces the learned BEV query only where the sum of
+            its channels is above zero, instead of everywhere where history reaches.
+        endpoint_warp_grid: history is warped on a grid whose first and last cells lie on the border of the ROI, but
+            sampled as if cells had their centres inside: a slight zoom at every frame.
+    """
+
+    mirrored_self_attention: bool = False
+    propagate_where_sum_is_positive: bool = False
+    endpoint_warp_grid: bool = False
+
+
+class BevFormerConfig(AttentionSection):
+    """ResNet-50, and learned queries of the ground cells that look into its three levels (BEVFormer).
+
+    Attributes:
+        rows: of the BEV grid, along y.
+        columns: of the BEV grid, along x.
+        width: channels of the image and of the BEV features.
+        cameras: their names; each has a learned code, so that a rig is put into this order.
+        pillar_low: lowest of the heights at which a cell looks into the images, metres in the ego frame.
+        pillar_high: highest of them.
+        pillar_points: number of heights; each head's samples take them in turns.
+    """
+
+    kind: Literal["bevformer"] = "bevformer"
+    rows: Positive = 50
+    columns: Positive = 100
+    width: Annotated[int, Field(gt=0, multiple_of=2)] = 256
+    heads: Positive = 8
+    layers: Positive = 2
+    hidden: Positive = 512
+    dropout: Fraction = 0.1
+    cameras: Annotated[tuple[str, ...], Field(min_length=1)] = NUSCENES_CAMERAS
+    pillar_low: float = -2.5
+    pillar_high: float = 4.5
+    pillar_points: Literal[1, 2, 4, 8] = 4
+    memory: EncoderBevMemoryConfig = EncoderBevMemoryConfig()
+    mask_stride: Literal[1] = 1
+    quirks: EncoderQuirks = EncoderQuirks()
+
+    @model_validator(mode="after")
+    def _pillars_stand_upright(self) -> Self:
+        if self.pillar_low >= self.pillar_high:
+            raise ValueError("pillar_low has to be below pillar_high")
+        return self
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Channels of the three BEV levels, fine to coarse."""
+        return self.width, self.width, self.width
+
+
+BevConfig = Annotated[
+    Annotated[LookupBevConfig, Tag("lookup")] | Annotated[BevFormerConfig, Tag("bevformer")], kind_of("lookup")
 ]
-"""How past BEV maps are used."""
+"""From images to the BEV grid (``rows`` x ``columns`` cells of ``H x W``), past BEV maps included."""
 
 
 class SegmentationConfig(Section):
     """The segmentation of the ground at twice the resolution of the BEV grid.
 
-    Attributes:
-        kind: ``pixel_shuffle`` computes on the BEV grid, ``upsampling`` (MapTracker) on the finer one.
+    ``pixel_shuffle`` computes on the BEV grid, ``upsampling`` (MapTracker) on the finer one.
     """
 
     kind: Literal["pixel_shuffle", "upsampling"] = "pixel_shuffle"
@@ -196,3 +202,9 @@ class DepthConfig(Section):
     bins: Positive = 32
     near: Metres = 1.0
     far: Metres = 45.0
+
+    @model_validator(mode="after")
+    def _near_is_before_far(self) -> Self:
+        if self.near >= self.far:
+            raise ValueError("near has to be less than far")
+        return self

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 
 Positive = Annotated[int, Field(gt=0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -27,6 +27,31 @@ class Section(BaseModel):
     """Base of all sections: unknown keys are refused and values do not change after construction."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class AttentionSection(Section):
+    """Base of sections with attention: each head takes its share of the width."""
+
+    width: Positive
+    heads: Positive
+
+    @model_validator(mode="after")
+    def _heads_share_the_width(self) -> Self:
+        if self.width % self.heads:
+            raise ValueError(f"width {self.width} has to be a multiple of heads ({self.heads})")
+        return self
+
+
+class Quirks(Section):
+    """Base of the oddities of the official code of MapTracker, part by part.
+
+    Its released weights need all of it; a network trained from scratch does not.
+    """
+
+    @classmethod
+    def official(cls) -> Self:
+        """Return all quirks switched on."""
+        return cls(**dict.fromkeys(cls.model_fields, True))
 
 
 def kind_of(default: str) -> Discriminator:

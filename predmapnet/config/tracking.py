@@ -1,8 +1,8 @@
-"""Which tracks live on, and which come back."""
+"""Rules by which tracks live on, and come back."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
@@ -10,11 +10,9 @@ from predmapnet.config.section import Fraction, Metres, Positive, Section
 
 
 class TrackingConfig(Section):
-    """Which rows live on (Sec. 3.1) and how tracks and detections of one instance become one row.
+    """Rules by which rows live on (Sec. 3.1) and tracks and detections of one instance become one row.
 
     Attributes:
-        query_assignment: ``one_way``: detection queries never see tracks and are trained on all of the truth;
-            ``suppress``: tracks take their truth away from the detections (the paper's and MapTracker's scheme).
         tau_d: a detection scored above it is born as a track.
         first_tau_d: the same in the first frame of a stream; ``tau_d`` by default.
         tau_t: a track scored above it is supported; others count a miss.
@@ -26,7 +24,6 @@ class TrackingConfig(Section):
         report_threshold: rows scored below are not reported at all.
     """
 
-    query_assignment: Literal["one_way", "suppress"] = "one_way"
     tau_d: Fraction = 0.5
     first_tau_d: Fraction | None = None
     tau_t: Fraction = 0.3

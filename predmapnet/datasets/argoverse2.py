@@ -194,9 +194,8 @@ class Argoverse2Source:
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which logs frames belong to; unknown tokens are absent.
 
-        Args:
-            tokens: ``<log>_<timestamp>`` as MapTRv2 and this package name frames, or the time stamp alone as
-                StreamMapNet and MapTracker do.
+        Tokens are ``<log>_<timestamp>`` as MapTRv2 and this package name frames, or the time stamp alone as
+        StreamMapNet and MapTracker do.
         """
         known: dict[str, str] = {}
         for info in self.scenes():
@@ -206,27 +205,12 @@ class Argoverse2Source:
 
 
 class Argoverse2Scene:
-    """One Argoverse 2 sensor log.
-
-    Attributes:
-        info: the log's line in the listing.
-        georeference: of its city.
-        timestamps: ``(n,) int64``, nanoseconds, of the key frames.
-    """
+    """One Argoverse 2 sensor log; its key frames are at ``timestamps (n,) int64``, nanoseconds."""
 
     georeference: Georeference | None
 
     def __init__(self, folder: Path, info: SceneInfo, timestamps: Integer) -> None:
-        """Read the poses; calibration, images and the map are read when they are asked for.
-
-        Args:
-            folder: of the log.
-            info: the log's line in the listing.
-            timestamps: ``(n,)`` of the sweeps that are frames, nanoseconds.
-
-        Raises:
-            UserError: poses are missing or damaged.
-        """
+        """Read the poses at time stamps ``(n,)``, nanoseconds, all else when it is asked for; raises UserError."""
         self.info = info
         self.georeference = argoverse2_georeference(info.location)
         self.timestamps = timestamps
@@ -293,9 +277,7 @@ class Argoverse2Scene:
     def frame(self, index: int) -> Frame:
         """Return frame ``index``: pose at exactly the sweep's time stamp, nearest image of each camera within 25 ms.
 
-        Raises:
-            IndexError: no such frame.
-            UserError: no calibration, no images, or a pose is missing or broken.
+        Raises IndexError, and UserError without calibration, images or a whole pose.
         """
         instant = self.instant(index)
         images = {name: _nearest(*self._images[name], instant.timestamp) for name in ARGOVERSE2_CAMERAS}

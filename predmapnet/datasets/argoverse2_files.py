@@ -87,15 +87,9 @@ def rows_by_sensor(path: Path, columns: tuple[str, ...]) -> dict[str, dict[str, 
 
 
 def read_table(path: Path, columns: tuple[str, ...], texts: tuple[str, ...] = ()) -> dict[str, NDArray[Any]]:
-    """Read a feather file: its columns by name.
+    """Read a feather file, by name the ``columns`` of numbers and the ``texts`` that it must have.
 
-    Args:
-        path: the file.
-        columns: those that it must have, of numbers.
-        texts: those that it must have besides.
-
-    Raises:
-        UserError: the file is missing or damaged, lacks a column, or a column holds something else.
+    Raises UserError where the file is missing or damaged, or lacks a column of that kind.
     """
     try:
         table = feather.read_table(path)

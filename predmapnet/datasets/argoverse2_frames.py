@@ -17,14 +17,11 @@ IMAGE_TOLERANCE = 25_000_000
 
 
 def sweeps_with_images(sweeps: Integer, images: Iterable[Integer]) -> Integer:
-    """Drop the sweeps for which a camera has no image within 25 ms.
+    """Return the time stamps of sweeps for which every camera has an image within 25 ms, in order.
 
     Args:
-        sweeps: ``(n,)`` time stamps, nanoseconds.
+        sweeps: ``(n,)``, nanoseconds.
         images: per camera ``(k,)`` ascending time stamps of its images.
-
-    Returns:
-        ``(m,)`` the time stamps that are kept, in order.
     """
     kept = np.ones(len(sweeps), dtype=bool)
     for times in images:
@@ -40,12 +37,7 @@ def sweeps_with_images(sweeps: Integer, images: Iterable[Integer]) -> Integer:
 def strided_over_logs(sweeps: Mapping[str, Integer], stride: int) -> dict[str, Integer]:
     """Take every ``stride``-th sweep of all logs one after the other: the rule of the new split.
 
-    Args:
-        sweeps: ascending time stamps by log, logs in the order of the split list.
-        stride: for example 4.
-
-    Returns:
-        Time stamps of the frames by log, in the same order; a short log may have none.
+    Ascending time stamps by log come and go in the order of the split list; a short log may keep none.
     """
     frames = {}
     before = 0
@@ -58,14 +50,8 @@ def strided_over_logs(sweeps: Mapping[str, Integer], stride: int) -> dict[str, I
 def strided_over_time(sweeps: Mapping[str, Integer], stride: int) -> dict[str, Integer]:
     """Take every ``stride``-th sweep of all logs sorted together by time: the rule of the old training split.
 
-    Logs that were recorded at the same time interleave, so that steps inside a log may be uneven.
-
-    Args:
-        sweeps: time stamps by log.
-        stride: for example 4.
-
-    Returns:
-        Ascending time stamps of the frames by log, logs in the order in which they first appear.
+    Logs that were recorded at the same time interleave, so that steps inside a log may be uneven. Logs come in the
+    order in which they first appear.
     """
     logs = list(sweeps)
     times = np.concatenate([np.zeros(0, dtype=np.int64), *sweeps.values()])

@@ -47,13 +47,7 @@ def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> U
 
 
 def check_principal_point(intrinsics: Float, width: int, height: int, where: str) -> None:
-    """Raise UserError if a camera's principal point lies outside of its image: they are of different sizes.
-
-    Args:
-        intrinsics: ``(3, 3)``.
-        width, height: pixels of the image.
-        where: file and camera, for the message.
-    """
+    """Raise UserError if a camera's principal point lies outside of its image: they are of different sizes."""
     x, y = float(intrinsics[0, 2]), float(intrinsics[1, 2])
     if not (0.0 < x < width and 0.0 < y < height) or not (intrinsics[[0, 1], [0, 1]] > 0.0).all():
         raise UserError(

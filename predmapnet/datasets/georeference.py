@@ -38,12 +38,7 @@ POINT_NEMO = (-48.8767, -123.3933)
 
 @dataclass(frozen=True)
 class SphereGeoreference:
-    """Bearing and distance from an origin on a sphere of the equatorial radius, as the nuScenes devkit exports.
-
-    Attributes:
-        name: of the map.
-        latitude, longitude: of the frame's origin, degrees.
-    """
+    """Bearing and distance from an origin, degrees, on a sphere of the equatorial radius, as in the nuScenes devkit."""
 
     name: str
     latitude: float
@@ -66,13 +61,7 @@ class SphereGeoreference:
 
 @dataclass(frozen=True)
 class UtmGeoreference:
-    """A city frame that is UTM shifted to an origin, as Argoverse 2 defines it.
-
-    Attributes:
-        name: of the city.
-        latitude, longitude: of the frame's origin, degrees.
-        zone: UTM zone, northern hemisphere.
-    """
+    """A city frame that is UTM shifted to an origin, degrees, as Argoverse 2 defines it; northern hemisphere."""
 
     name: str
     latitude: float
@@ -95,9 +84,7 @@ class UtmGeoreference:
 class LocalFrame:
     """A frame whose place on Earth is not known: its maps lie about longitude 0 and latitude 0, where no road is.
 
-    Attributes:
-        frame: name of the frame; maps of one frame may be merged.
-        east, north: metres that are taken off first, of frames whose coordinates are large (UTM, for example).
+    Maps of one ``frame`` may be merged; ``east`` and ``north`` are metres taken off large coordinates (as of UTM).
     """
 
     frame: str
@@ -158,25 +145,18 @@ def argoverse2_georeference(city: str) -> UtmGeoreference | None:
 
 
 def demo_georeference(name: str, index: int) -> SphereGeoreference:
-    """Return a place in the South Pacific for a demo town; towns lie on a grid of 0.1 degrees and never overlap.
+    """Return a place in the South Pacific for a demo town of that seed.
 
-    Args:
-        name: of the town.
-        index: seed of the town, from 0; towns may be 10 km across.
+    Towns lie on a grid of 0.1 degrees and never overlap; they may be 10 km across.
     """
     row, column = divmod(index, 20)
     return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)
 
 
 def georeference_of(location: str, synthetic: bool = False) -> SphereGeoreference | UtmGeoreference | None:
-    """Return where the frame of a location lies: a nuScenes map, an Argoverse 2 city or a town of the demo world.
+    """Return where a frame lies (``boston-seaport``, ``PIT``, ``town-0101``), or None for an unknown location.
 
-    Args:
-        location: as frames' files and maps name it: ``boston-seaport``, ``PIT``, ``town-0101``.
-        synthetic: whether the place is made up; a made-up one never lies where a real one does.
-
-    Returns:
-        The georeference, or None for an unknown location.
+    A made-up (``synthetic``) place never lies where a real one does.
     """
     town = re.fullmatch(r"town-(\d{4})", location)
     if town is not None:

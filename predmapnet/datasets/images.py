@@ -24,16 +24,9 @@ _END_OR_STRAY = re.compile(rb"\xff[^\x00\xff\xd0-\xd7\xda\xc4\xdb-\xdd\xe0-\xef\
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Read an image; its EXIF orientation is not applied.
+    """Read a JPEG or PNG file as ``(height, width, 3) uint8``, RGB; its EXIF orientation is not applied.
 
-    Args:
-        path: a JPEG or PNG file.
-
-    Returns:
-        ``(height, width, 3) uint8``, RGB.
-
-    Raises:
-        UserError: the file is missing, empty, cut short, damaged or not an image.
+    Raises UserError for a file that is missing, empty, cut short, damaged or not an image.
     """
     try:
         data = path.read_bytes()
@@ -66,12 +59,7 @@ def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class _Header:
-    """What the segments before the pixels of a JPEG say.
-
-    Attributes:
-        pixels: position where the pixels begin, past thumbnails and comments that have end markers of their own.
-        baseline: whether it is a baseline JPEG, as nearly all cameras write.
-    """
+    """Header of a JPEG: where its pixels begin (past thumbnails and comments), and whether it is a baseline JPEG."""
 
     pixels: int
     baseline: bool

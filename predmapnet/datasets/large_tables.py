@@ -32,9 +32,7 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 class Mark:
     """Field by whose text most records of a table can be passed over without being parsed.
 
-    Attributes:
-        pattern: of the field's name and value; group 1 is the value.
-        wanted: whether records of a value are looked at.
+    Group 1 of the pattern is its value, and ``wanted`` says whether records of a value are looked at.
     """
 
     pattern: re.Pattern[bytes]

@@ -15,18 +15,7 @@ NUSCENES_COLUMNS = 5
 
 
 def read_nuscenes_sweep(path: Path, lidar_to_ego: Float) -> Float:
-    """Read a ``.pcd.bin`` file.
-
-    Args:
-        path: of the sweep.
-        lidar_to_ego: ``(4, 4)``.
-
-    Returns:
-        ``(n, 3) float64``, metres, ego frame.
-
-    Raises:
-        UserError: the file's length is not that of whole points.
-    """
+    """Read a ``.pcd.bin`` file (of whole points, else UserError) as points ``(n, 3) float64``, metres, ego frame."""
     numbers = np.fromfile(path, dtype="<f4")
     if len(numbers) % NUSCENES_COLUMNS:
         raise UserError(f"{path} is not a nuScenes lidar sweep: {len(numbers)} numbers are no whole points.")

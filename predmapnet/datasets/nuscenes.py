@@ -173,15 +173,7 @@ class NuScenesScene:
         ground_truth: Callable[[], NuScenesGroundTruth | None],
         georeference: Georeference | None,
     ) -> None:
-        """Read the scene's records.
-
-        Args:
-            root: folder with ``samples``.
-            tables: of the version.
-            info: the scene's line in the listing.
-            ground_truth: reads its map, if there is one; called when it is needed.
-            georeference: of the global frame, if it is known.
-        """
+        """Read the scene's records below ``root``, the folder with ``samples``; its map is read when it is needed."""
         self.info = info
         self._read_ground_truth = ground_truth
         self.georeference = georeference
@@ -290,12 +282,7 @@ class NuScenesScene:
         return self._sensor_poses[token]
 
     def instant(self, index: int) -> Instant:
-        """Return token, time stamp and pose of frame ``index``, as :meth:`frame` does.
-
-        Raises:
-            IndexError: no such frame.
-            UserError: a pose is missing, not finite or not rigid.
-        """
+        """Return token, time stamp and pose of frame ``index``; raises as :meth:`frame` does."""
         if not 0 <= index < len(self._frames):
             raise IndexError(f"{self.info.name} has {len(self._frames)} frames, not a frame {index}")
         ego_to_global, lidar_to_ego = self._poses(index)

@@ -34,8 +34,7 @@ def find_versions(root: Path) -> tuple[str, ...]:
 def choose_version(root: Path, version: str | None) -> str:
     """Return the table folder to open: the given one, or else trainval before others, mini only when alone.
 
-    Raises:
-        UserError: nothing there, not what was asked for, or several without a clear first choice.
+    Raises UserError where there is none, not that one, or several without a clear first choice.
     """
     if not root.is_dir():
         raise UserError(f"The nuScenes folder {root} does not exist.")
@@ -75,11 +74,7 @@ class SensorData(NamedTuple):
 
 @dataclass(frozen=True)
 class Tables:
-    """One ``v1.0-*`` folder.
-
-    Attributes:
-        folder: of the tables.
-    """
+    """One ``v1.0-*`` folder of tables."""
 
     folder: Path
 

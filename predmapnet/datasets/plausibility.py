@@ -30,15 +30,9 @@ SIDEWAYS = 60.0
 
 
 def judged_unit(times: Integer, positions: Float, stated: str = "nanoseconds") -> str:
-    """Return the unit that time stamps are in, judged by their size and by the speed of the car.
+    """Return the unit that time stamps ``(n,)`` are in, judged by their size and by the speed of the car.
 
-    Args:
-        times: ``(n,) int64`` of one drive, ascending.
-        positions: ``(n, 2)`` metres, of the car at those times.
-        stated: the unit that they should be in.
-
-    Returns:
-        ``stated`` where that is plausible, or where no other unit is.
+    That is the ``stated`` one where it is plausible, or where no other unit is. Positions are ``(n, 2)``, metres.
     """
     if len(times) < 2:
         return stated
@@ -70,10 +64,7 @@ def trajectory_problem(rotations: Float, positions: Float, reordered: Float | No
     Args:
         rotations: ``(n, 3, 3)`` of ``ego_to_global``, in the order of time.
         positions: ``(n, 2)`` metres.
-        reordered: ``(n, 3, 3)`` the rotations that the same quaternions mean if they are x, y, z, w.
-
-    Returns:
-        A sentence that says which order would fit, if one does.
+        reordered: the rotations that the same quaternions mean if they are x, y, z, w.
     """
     if len(rotations) < 2:
         return None
@@ -102,9 +93,7 @@ def drives_backwards(rotations: Float, positions: Float) -> bool:
 def camera_problem(rotations: Float, reordered: Float) -> str | None:
     """Say whether cameras look at the road only if their quaternions are in another order; None if all is well.
 
-    Args:
-        rotations: ``(n, 3, 3)`` of the cameras' ``camera_to_ego``.
-        reordered: what the same quaternions mean if they are x, y, z, w.
+    ``reordered`` are the ``camera_to_ego`` rotations that the same quaternions mean if they are x, y, z, w.
     """
     if _upright(rotations).mean() <= 0.5 and _upright(reordered).all():
         return (

@@ -40,18 +40,9 @@ def combined(outer: Float, inner: Float) -> Float:
 
 
 def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], where: str) -> Float:
-    """Build a pose from a quaternion and a translation.
+    """Build a pose ``(4, 4) float64`` from a quaternion w, x, y, z and a translation, metres.
 
-    Args:
-        rotation_wxyz: unit quaternion w, x, y, z.
-        translation: x, y, z in metres.
-        where: scene, frame and file, for the message.
-
-    Returns:
-        ``(4, 4) float64``.
-
-    Raises:
-        UserError: a value is missing, not finite, or the quaternion is not a rotation.
+    Raises UserError, naming ``where``, for values that are missing or not finite, and for no rotation.
     """
     try:
         quaternion = np.array(rotation_wxyz, dtype=np.float64).reshape(4)

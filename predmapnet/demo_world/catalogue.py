@@ -121,12 +121,12 @@ def town_of(name: str) -> Town:
 
 
 def vector_map(name: str) -> VectorMap:
-    """What is true about the road in a scene."""
+    """The true map of a scene's road."""
     return town_of(name).vector_map
 
 
 def trajectory(name: str) -> Trajectory:
-    """Where the car is at each key frame of a scene."""
+    """The poses of the car at the key frames of a scene."""
     return _town_and_drive(scene_number(name))[1]
 
 
@@ -151,18 +151,14 @@ def default_cache() -> Path:
 
 
 def scene_folder(name: str, cache: Path, edition: int = WORLD_VERSION) -> Path:
-    """Where a scene lies as a nuScenes data set, whether it has been rendered or not."""
+    """The folder of a scene as a nuScenes data set, whether it has been rendered or not."""
     return cache / f"demo-world-v{WORLD_VERSION}{'-first-towns' if edition == 1 else ''}" / name
 
 
 def ensure_scene(name: str, cache: Path, progress: Progress | None = None, edition: int = WORLD_VERSION) -> Path:
-    """Render a scene unless that has been done.
+    """Render a scene (``scene-0103``) below a cache folder unless that has been done; ``progress`` hears of key frames.
 
-    Args:
-        name: for example ``scene-0103``.
-        cache: the folder that holds all scenes.
-        progress: called once per key frame.
-        edition: of the world; 1 has the towns of the first one, drawn as scenes are drawn today.
+    ``edition`` 1 has the towns of the first world, drawn as scenes are drawn today.
 
     Returns:
         The root of a nuScenes data set (``v1.0-mini``, ``samples``, ``maps``) with this one scene.

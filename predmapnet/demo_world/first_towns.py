@@ -13,20 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
-
-Float = NDArray[np.float64]
 
 
 def first_town(number: int) -> tuple[VectorMap, Trajectory]:
-    """Return the map and the drive of a scene of the first world.
-
-    Args:
-        number: of the scene, 101 to 110.
-    """
+    """Return the map and the drive of a scene of the first world, 101 to 110."""
     town = _towns()[str(number)]
     vector_map = VectorMap(
         road_segments=_polygons(town["road_segments"]),

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 IMAGE_SIZE = (800, 450)
 """Width and height, pixels: half of the nuScenes cameras."""
@@ -23,16 +21,13 @@ def _pose(rotation: Float, x: float, y: float, z: float) -> Float:
     return pose
 
 
-def _turn(yaw_degrees: float) -> Float:
-    cos, sin = np.cos(np.radians(yaw_degrees)), np.sin(np.radians(yaw_degrees))
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
 def _camera(name: str, x: float, y: float, z: float, yaw_degrees: float, focal: float = 1260.0) -> Camera:
     """A level camera; ``focal`` in pixels of the 1600 x 900 sensor, its principal point at (800, 490)."""
     full_size = np.array([[focal, 0.0, 800.0], [0.0, focal, 490.0], [0.0, 0.0, 1.0]])
     intrinsics = np.diag([0.5, 0.5, 1.0]) @ full_size
-    return Camera(name, *IMAGE_SIZE, intrinsics, _pose(_turn(yaw_degrees) @ _OPTICAL_TO_LEVEL, x, y, z))
+    cos, sin = np.cos(np.radians(yaw_degrees)), np.sin(np.radians(yaw_degrees))
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return Camera(name, *IMAGE_SIZE, intrinsics, _pose(turn @ _OPTICAL_TO_LEVEL, x, y, z))
 
 
 DEMO_RIG: Rig = (

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 DEMO_SHARE = 1 / 3
 """Share of the seeds that get the demo car."""
@@ -26,7 +24,7 @@ _OPTICAL_TO_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the cameras of one kind of rig look.
+    """Directions of the cameras of one kind of rig.
 
     Attributes:
         yaws: degrees to the left of the car's heading, the first one ahead.
@@ -59,9 +57,6 @@ _WIDTHS = (640, 800, 960, 1280, 1600, 1920)
 def sample_rig(seed: int) -> Rig:
     """Draw the rig of one car: a third of the seeds get the demo car, the others a car of their own.
 
-    Args:
-        seed: the same seed gives the same rig.
-
     Returns:
         One to eight cameras, the first one looking ahead. Ego axes are those of the car; its origin lies below the
         rear axle on the road, or above it (``ground_height`` is then negative), as data sets have it.
@@ -80,7 +75,7 @@ def sample_rig(seed: int) -> Rig:
 
 @dataclass(frozen=True)
 class _Car:
-    """What the cameras of one car have in common.
+    """Common properties of the cameras of one car.
 
     Attributes:
         height: of the cameras above the road, metres.

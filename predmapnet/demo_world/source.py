@@ -40,11 +40,7 @@ class DemoSource:
         )
 
     def open(self, scene: str, progress: Progress | None = None) -> NuScenesScene:
-        """Render a scene if need be, and open it.
-
-        Raises:
-            UserError: a scene that does not exist, or a cache folder that cannot be written to.
-        """
+        """Render a scene if need be, and open it; raises UserError for an unknown one and a cache that is full."""
         folder = ensure_scene(scene, self.root, progress, self.edition)
         (info,) = (info for info in scene_infos(edition=self.edition) if info.name == scene)
         written = NuScenesSource(folder).open(scene)

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from shapely import Polygon
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 
 class LineStyle(StrEnum):
-    """How a divider is painted."""
+    """Paint of a divider."""
 
     SOLID = "solid"
     DASHED = "dashed"
@@ -28,7 +28,7 @@ class LineStyle(StrEnum):
 
 
 class CrossingStyle(StrEnum):
-    """How a pedestrian crossing is painted."""
+    """Paint of a pedestrian crossing."""
 
     ZEBRA = "zebra"
     """Bars along the direction of travel of the cars."""
@@ -87,7 +87,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class VectorMap:
-    """What is true about the road, the source of all ground truth.
+    """The true road, the source of all ground truth.
 
     Attributes:
         road_segments: drivable surface; islands and medians are holes (or gaps).
@@ -117,12 +117,9 @@ class VectorMap:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the ego car is at each key frame.
+    """Poses of the ego car at the key frames: ``(n,) int64`` nanoseconds and ``(n, 4, 4) float64``.
 
-    Attributes:
-        timestamps: ``(n,) int64``, nanoseconds.
-        ego_to_global: ``(n, 4, 4) float64``; ego origin on the ground below the rear axle, small pitch and
-            roll included.
+    The ego origin is on the ground below the rear axle; small pitch and roll are included.
     """
 
     timestamps: NDArray[np.int64]

@@ -17,7 +17,7 @@ import shapely
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind
-from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
+from predmapnet.evaluation.chamfer_ap import chamfer_matches
 from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
 from predmapnet.evaluation.precision_recall import Matches
 
@@ -34,35 +34,16 @@ _FAR = 1e6
 
 
 def half_matches(frame: EvaluationFrame, half: Half, thresholds: Sequence[float]) -> Matches:
-    """Match the predictions of one half of a frame.
-
-    Args:
-        frame: prediction and ground truth.
-        half: ahead of the car or behind it.
-        thresholds: chamfer distances, metres.
-    """
+    """Match the predictions of one half of a frame; thresholds are chamfer distances, metres."""
     owners, predicted = cut_at_middle(frame.predicted.kinds, frame.predicted.polylines, half)
     true_owners, truths = cut_at_middle(frame.truth.kinds, frame.truth.polylines, half)
     kinds, scores = frame.predicted.kinds[owners], frame.predicted.scores[owners]
     true_kinds = frame.truth.kinds[true_owners]
-    matrix = chamfer_matrix(
-        resample_all(predicted, POINTS_PER_LINE),
-        kinds,
-        resample_all(simplify_all(truths), POINTS_PER_LINE),
-        true_kinds,
-        limit=max(thresholds),
-    )
-    flags = (match_greedily(matrix, scores, thresholds) >= 0).astype(np.int8)
-    return Matches(kinds, scores, flags, np.bincount(true_kinds, minlength=len(ElementKind)))
+    return chamfer_matches(kinds, scores, predicted, true_kinds, simplify_all(truths), thresholds)
 
 
 def cut_at_middle(kinds: Integer, polylines: Sequence[Float], half: Half) -> tuple[Integer, list[Float]]:
-    """Cut elements at ``x = 0``.
-
-    Args:
-        kinds: ``(n,)``.
-        polylines: ``n`` arrays ``(k, 2)``, metres, ego frame.
-        half: that is kept.
+    """Cut elements, lines ``(k, 2)`` of the ego frame, at ``x = 0``.
 
     Returns:
         Row of the element that each piece belongs to, ascending, and the pieces. What lies wholly in the half stays as

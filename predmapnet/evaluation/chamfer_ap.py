@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mapfusion.elements import ElementKind, RegionOfInterest
+from mapfusion.arrays import Float, Integer
+from mapfusion.elements import RegionOfInterest
 from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
 from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
-from predmapnet.evaluation.precision_recall import AveragePrecision, accumulate
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate
 
 Thresholds = tuple[float, ...]
 
@@ -31,42 +29,30 @@ def thresholds_for(roi: RegionOfInterest) -> Thresholds:
 def chamfer_average_precision(
     frames: Sequence[EvaluationFrame], thresholds: Thresholds = STANDARD_THRESHOLDS
 ) -> AveragePrecision:
-    """Average precision of the predictions of all frames together.
+    """Average precision of the predictions of all frames together; thresholds are metres, ascending.
 
-    Args:
-        frames: scenes in the order of their names, frames in order of time (the order only decides equal scores).
-        thresholds: metres, ascending.
-
-    Returns:
-        Per kind and threshold; ``mean`` is the mAP.
+    Scenes come in the order of their names and frames in order of time (the order only decides equal scores).
     """
-    flags = [frame_flags(frame, thresholds) for frame in frames]
-    return chamfer_from_flags(frames, flags, thresholds)
+    return accumulate([frame_matches(frame, thresholds) for frame in frames], thresholds)
 
 
-def chamfer_from_flags(
-    frames: Sequence[EvaluationFrame], flags: Sequence[NDArray[np.int8]], thresholds: Thresholds
-) -> AveragePrecision:
-    """Accumulate the :func:`frame_flags` of frames, which may come from several processes."""
-    truths = [sum(int((frame.truth.kinds == kind).sum()) for frame in frames) for kind in ElementKind]
-    return accumulate(
-        [frame.predicted.kinds for frame in frames],
-        [frame.predicted.scores for frame in frames],
-        flags,
-        truths,
-        thresholds,
-    )
+def frame_matches(frame: EvaluationFrame, thresholds: Thresholds = STANDARD_THRESHOLDS) -> Matches:
+    """Match the predictions of one frame."""
+    predicted, truth = frame.predicted, frame.truth
+    truths = simplify_all(truth.polylines)
+    return chamfer_matches(predicted.kinds, predicted.scores, predicted.polylines, truth.kinds, truths, thresholds)
 
 
-def frame_flags(frame: EvaluationFrame, thresholds: Thresholds = STANDARD_THRESHOLDS) -> NDArray[np.int8]:
-    """Decide which predictions of one frame are true positives.
-
-    Returns:
-        ``(n, thresholds) int8``: 1 true positive, 0 false positive.
-    """
-    predicted = resample_all(frame.predicted.polylines, POINTS_PER_LINE)
-    truths = resample_all(simplify_all(frame.truth.polylines), POINTS_PER_LINE)
+def chamfer_matches(
+    kinds: Integer,
+    scores: Float,
+    lines: Sequence[Float],
+    true_kinds: Integer,
+    truths: Sequence[Float],
+    thresholds: Sequence[float],
+) -> Matches:
+    """Match predicted lines to true ones of their kind, ``(k, 2)`` each, metres."""
+    sampled, true = resample_all(lines, POINTS_PER_LINE), resample_all(truths, POINTS_PER_LINE)
     # A truth beyond the largest threshold can never be matched, wherever exactly it lies.
-    matrix = chamfer_matrix(predicted, frame.predicted.kinds, truths, frame.truth.kinds, limit=max(thresholds))
-    matched = match_greedily(matrix, frame.predicted.scores, thresholds)
-    return (matched >= 0).astype(np.int8)
+    matrix = chamfer_matrix(sampled, kinds, true, true_kinds, limit=max(thresholds))
+    return Matches.of(kinds, scores, match_greedily(matrix, scores, thresholds), true_kinds)

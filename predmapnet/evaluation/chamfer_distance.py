@@ -15,16 +15,9 @@ POINTS_PER_LINE = 200
 
 
 def resample_all(polylines: Sequence[Float], count: int) -> Float:
-    """Place ``count`` points at equal distances along each line, both ends included.
+    """Place ``count`` points at equal distances along each line ``(k, 2)``, both ends included: ``(n, count, 2)``.
 
-    The same result as :func:`mapfusion.geometry.resample` line by line, for the thousands of lines of an evaluation.
-
-    Args:
-        polylines: ``n`` arrays ``(k, 2)``, ``k >= 1``, metres.
-        count: at least 2.
-
-    Returns:
-        ``(n, count, 2) float64``; a line without length repeats its first point.
+    The same as :func:`mapfusion.geometry.resample` line by line, for the thousands of lines of an evaluation.
     """
     if not polylines:
         return np.zeros((0, count, 2))
@@ -38,17 +31,10 @@ def resample_all(polylines: Sequence[Float], count: int) -> Float:
 def chamfer_matrix(
     predicted: Float, predicted_kinds: Integer, truths: Float, truth_kinds: Integer, limit: float = np.inf
 ) -> Float:
-    """Mean of the two directed mean nearest-point distances, for all pairs of one kind.
+    """Mean of the two directed mean nearest-point distances, for all pairs of one kind, metres: ``(n, m)``.
 
-    Args:
-        predicted: ``(n, p, 2) float64``, resampled lines, metres.
-        predicted_kinds: ``(n,)``.
-        truths: ``(m, p, 2) float64``.
-        truth_kinds: ``(m,)``.
-        limit: pairs that are certainly farther apart than this are not computed to the end, metres.
-
-    Returns:
-        ``(n, m) float64``, metres; infinite for pairs of different kinds and for pairs beyond ``limit``.
+    Lines are ``(n, p, 2)`` and ``(m, p, 2) float64``. Infinite for pairs of different kinds and for those beyond
+    ``limit``, which are not computed to the end.
     """
     matrix: Float = _chamfer_matrix(
         np.ascontiguousarray(predicted.transpose(0, 2, 1)),

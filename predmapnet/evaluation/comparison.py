@@ -49,12 +49,7 @@ _SAME = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over scenes and its interval.
-
-    Attributes:
-        mean: over the scenes.
-        low, high: ends of the interval; equal to the mean if there is one scene only.
-    """
+    """Mean over scenes and its interval, which has no width if there is one scene only."""
 
     mean: float
     low: float
@@ -65,10 +60,8 @@ class Estimate:
 class MethodFigure:
     """One figure of one method.
 
-    Attributes:
-        pooled: the official figure over all scenes together; None where it does not exist.
-        scenes: mean over the scenes.
-        difference: to the first method, scene by scene; None for the first.
+    ``pooled`` is the official one over all scenes together (None where it does not exist), ``difference`` that to the
+    first method, scene by scene (None for the first).
     """
 
     pooled: float | None
@@ -121,11 +114,7 @@ class Comparison:
 
 
 def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
-    """Compare evaluations.
-
-    Args:
-        paths: files of ``predmapnet evaluate --json``, at least two; the first is the one to compare with.
-        seed: of the draws.
+    """Compare evaluations, files of ``predmapnet evaluate --json``, with the first of them; ``seed`` is of the draws.
 
     Raises:
         UserError: a file is missing, is no evaluation or has no figures of single scenes, or the evaluations are of
@@ -201,7 +190,8 @@ def _check_same(paths: Sequence[Path], evaluations: Sequence[Mapping[str, Any]])
 
 
 def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
-    notes = [] if scenes >= FEW_SCENES else [f"{_scenes(scenes)} only: the intervals are narrower than the truth"]
+    few = "1 scene" if scenes == 1 else f"{scenes} scenes"
+    notes = [] if scenes >= FEW_SCENES else [f"{few} only: the intervals are narrower than the truth"]
     if not _same_stability(evaluations):
         notes.append("the stability was measured by different protocols and is left out")
     if len({content.get("consistency_ap", {}).get("ids") for content in evaluations}) > 1:
@@ -210,10 +200,6 @@ def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
     for content in evaluations:
         shared |= dict.fromkeys(content["evaluated"].get("warnings", []))
     return [*notes, *shared]
-
-
-def _scenes(count: int) -> str:
-    return "1 scene" if count == 1 else f"{count} scenes"
 
 
 def _same_stability(evaluations: Sequence[Mapping[str, Any]]) -> bool:

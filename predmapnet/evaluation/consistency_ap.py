@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapfusion.arrays import Integer
 from mapfusion.elements import ElementKind
-from predmapnet.evaluation.chamfer_ap import STANDARD_THRESHOLDS, Thresholds, chamfer_from_flags
+from predmapnet.evaluation.chamfer_ap import STANDARD_THRESHOLDS, Thresholds
 from predmapnet.evaluation.chamfer_distance import (
     POINTS_PER_LINE,
     chamfer_matrix,
@@ -23,10 +23,8 @@ from predmapnet.evaluation.chamfer_distance import (
     resample_all,
 )
 from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
-from predmapnet.evaluation.precision_recall import AveragePrecision
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate
 from predmapnet.evaluation.tracks import form_tracks, truth_track_ids
-
-Flags = NDArray[np.int8]
 
 _TRUTH_POINTS = 20
 """The official code takes truths through this many points before it measures."""
@@ -35,19 +33,16 @@ _TRUTH_POINTS = 20
 def consistency_average_precision(
     frames: Sequence[EvaluationFrame], thresholds: Thresholds = STANDARD_THRESHOLDS, anchored: bool = True
 ) -> AveragePrecision:
-    """C-mAP with the track ids that the predictions carry.
+    """C-mAP with the track ids that the predictions carry; those with track id -1 take no part.
 
-    Args:
-        frames: scenes one after the other, frames in order; predictions with track id -1 take no part.
-        thresholds: metres.
-        anchored: False switches the consistency off (the official ``--consist 0``), which shows what it costs.
+    Scenes come one after the other, with their frames in order. Without ``anchored`` nobody asks for consistency (the
+    official ``--consist 0``), which shows what it costs.
     """
-    flags: list[Flags] = []
+    matches: list[Matches] = []
     for _, group in groupby(frames, key=lambda frame: frame.scene):
         scene = list(group)
-        matched = matched_tracks(scene, truth_track_ids(scene), thresholds)
-        flags += consistency_flags(scene, matched, anchored)
-    return chamfer_from_flags(frames, flags, thresholds)
+        matches += consistency_matches(scene, matched_tracks(scene, truth_track_ids(scene), thresholds), anchored)
+    return accumulate(matches, thresholds)
 
 
 def with_formed_tracks(frames: Sequence[EvaluationFrame]) -> list[EvaluationFrame]:
@@ -62,43 +57,29 @@ def with_formed_tracks(frames: Sequence[EvaluationFrame]) -> list[EvaluationFram
 def matched_tracks(
     frames: Sequence[EvaluationFrame], truth_ids: Sequence[Integer], thresholds: Thresholds = STANDARD_THRESHOLDS
 ) -> list[Integer]:
-    """Find the true track of each tracked prediction, frame by frame.
+    """Find the true track of each tracked prediction, frame by frame: ``(n, thresholds) int64`` ids, -1 for none.
 
-    Args:
-        frames: any frames.
-        truth_ids: per frame ``(m,)`` track ids of the truths, unique per kind.
-        thresholds: metres.
-
-    Returns:
-        Per frame ``(n, thresholds) int64``: track id of the truth that the prediction finds, or -1.
+    ``truth_ids`` are per frame the ``(m,)`` track ids of the truths, unique per kind.
     """
     return [_matched_tracks(frame, ids, thresholds) for frame, ids in zip(frames, truth_ids, strict=True)]
 
 
-def consistency_flags(
+def consistency_matches(
     frames: Sequence[EvaluationFrame], matched: Sequence[Integer], anchored: bool = True
-) -> list[Flags]:
-    """Decide which predictions of one scene are true positives.
-
-    Args:
-        frames: all frames of the scene in order.
-        matched: their :func:`matched_tracks`.
-        anchored: see :func:`consistency_average_precision`.
-
-    Returns:
-        Per frame ``(n, thresholds) int8``: 1 true positive, 0 false positive, -1 not counted.
-    """
+) -> list[Matches]:
+    """Decide which predictions of a scene are true positives by the :func:`matched_tracks` of its frames in order."""
     owners: dict[tuple[int, int, int], int] = {}
-    flags = []
+    matches = []
     for frame, found in zip(frames, matched, strict=True):
         kinds, tracks = frame.predicted.kinds, frame.predicted.track_ids
+        match = Matches.of(kinds, frame.predicted.scores, found, frame.truth.kinds)
         counted = (tracks >= 0) & np.isin(kinds, frame.truth.kinds)
-        frame_flags = np.where(counted[:, None], found >= 0, -1).astype(np.int8)
+        match.flags[~counted] = -1
         if anchored:
             for column in range(found.shape[1]):
-                _anchor(np.flatnonzero(counted), kinds, tracks, found[:, column], column, owners, frame_flags)
-        flags.append(frame_flags)
-    return flags
+                _anchor(np.flatnonzero(counted), kinds, tracks, found[:, column], column, owners, match.flags)
+        matches.append(match)
+    return matches
 
 
 def _matched_tracks(frame: EvaluationFrame, truth_ids: Integer, thresholds: Thresholds) -> Integer:
@@ -122,7 +103,7 @@ def _anchor(
     matched: Integer,
     column: int,
     owners: dict[tuple[int, int, int], int],
-    flags: Flags,
+    flags: NDArray[np.int8],
 ) -> None:
     """Turn true positives of tracks that do not own what they found into false positives (changes ``flags``).
 

@@ -17,6 +17,7 @@ import shapely
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import clip_line, inverse_pose, resample, transform_points
+from mapfusion.ground import region
 from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
 from predmapnet.evaluation.frames import EvaluationFrame
 
@@ -48,13 +49,9 @@ class ForecastErrors:
 
 
 def forecast_errors(frames: Sequence[EvaluationFrame]) -> ForecastErrors:
-    """Measure all forecasts of one scene; the first frame has no past ego motion and is left out.
-
-    Args:
-        frames: all frames of the scene in order.
-    """
+    """Measure all forecasts of one scene; its first frame has no past ego motion and is left out."""
     collected: tuple[list[list[float]], ...] = tuple([] for _ in HORIZONS)
-    targets = [_targets(frame) for frame in frames]
+    targets = [*map(_targets, frames), *({} for _ in range(max(HORIZONS)))]
     for now in range(1, len(frames)):
         predicted = frames[now].predicted
         if predicted.forecasts is None:
@@ -67,11 +64,7 @@ def forecast_errors(frames: Sequence[EvaluationFrame]) -> ForecastErrors:
             line = resample(predicted.polylines[row], POINTS)
             forecast = resample(predicted.forecasts[row], POINTS)
             for horizon, errors in zip(HORIZONS, collected, strict=True):
-                target = (
-                    targets[now + horizon].get((kind, int(predicted.track_ids[row])))
-                    if (now + horizon < len(frames))
-                    else None
-                )
+                target = targets[now + horizon].get((kind, int(predicted.track_ids[row])))
                 if target is not None:
                     moved = _moved(line, np.linalg.matrix_power(motion, horizon), kind, predicted.roi)
                     candidates = (line + horizon * (forecast - line), line, moved)
@@ -88,11 +81,9 @@ def pool_forecasts(parts: Sequence[ForecastErrors]) -> ForecastErrors:
 
 
 def pointwise_error(points: Float, target: Float, ring: bool) -> float:
-    """Mean distance of corresponding points, metres, for the best direction (and start, if it is a ring).
+    """Mean distance of corresponding points ``(n, 2)``, metres, for the best direction (and start, if it is a ring).
 
-    Args:
-        points, target: ``(n, 2)``, the same number of points at equal distances.
-        ring: closed, the first point repeated at the end.
+    Both have equally many points at equal distances; a ring repeats the first one at the end.
     """
     orders = np.stack([target, target[::-1]])
     if ring:
@@ -121,8 +112,7 @@ def _moved(line: Float, motion: Float, kind: ElementKind, roi: RegionOfInterest)
     """Move a polyline into the next ego frame and clip it to the ROI; unclipped if nothing of it stays inside."""
     moved = transform_points(motion, line)
     if kind.is_ring:
-        box = shapely.box(-roi.length / 2, -roi.width / 2, roi.length / 2, roi.width / 2)
-        inside = shapely.get_parts(shapely.intersection(shapely.make_valid(shapely.Polygon(moved)), box))
+        inside = shapely.get_parts(shapely.intersection(shapely.make_valid(shapely.Polygon(moved)), region(roi)))
         polygons = [part for part in inside if part.geom_type == "Polygon" and not part.is_empty]
         parts = [shapely.get_coordinates(polygon.exterior) for polygon in polygons]
     else:

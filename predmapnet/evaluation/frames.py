@@ -68,13 +68,9 @@ def _check_elements(where: str, kinds: Integer, polylines: Sequence[Float]) -> N
 
 
 def simplify_all(polylines: Sequence[Float]) -> tuple[Float, ...]:
-    """Simplify lines by 0.2 m with topology kept, as the official evaluation does with its ground truth.
+    """Simplify lines ``(k, 2)`` by 0.2 m with topology kept, as the official evaluation does with its ground truth.
 
-    Args:
-        polylines: arrays ``(k, 2)``, metres.
-
-    Returns:
-        One array ``(k', 2) float64`` per line, ``k' <= k``; one-point lines are returned unchanged.
+    Lines of one point stay as they are.
     """
     drawable = [row for row, points in enumerate(polylines) if len(points) >= 2]
     result = list(polylines)

@@ -16,44 +16,34 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.elements import ElementKind
 from predmapnet.evaluation.chamfer_distance import match_greedily, resample_all
 from predmapnet.evaluation.frames import EvaluationFrame, simplify_all
+from predmapnet.evaluation.precision_recall import Matches
 
 FRECHET_POINTS = 100
 FRECHET_THRESHOLDS = (1.0, 2.0, 3.0)
 """Metres, in every region."""
 
 
-def frechet_flags(frame: EvaluationFrame, thresholds: Sequence[float] = FRECHET_THRESHOLDS) -> NDArray[np.int8]:
-    """Decide which predictions of one frame are true positives.
-
-    Returns:
-        ``(n, thresholds) int8``: 1 true positive, 0 false positive.
-    """
+def frechet_matches(frame: EvaluationFrame, thresholds: Sequence[float] = FRECHET_THRESHOLDS) -> Matches:
+    """Match the predictions of one frame."""
     predicted = resample_all(frame.predicted.polylines, FRECHET_POINTS)
     truths = resample_all(simplify_all(frame.truth.polylines), FRECHET_POINTS)
     matrix = frechet_matrix(predicted, frame.predicted.kinds, truths, frame.truth.kinds, max(thresholds))
-    return (match_greedily(matrix, frame.predicted.scores, thresholds) >= 0).astype(np.int8)
+    scores = frame.predicted.scores
+    return Matches.of(frame.predicted.kinds, scores, match_greedily(matrix, scores, thresholds), frame.truth.kinds)
 
 
 def frechet_matrix(
     predicted: Float, predicted_kinds: Integer, truths: Float, truth_kinds: Integer, limit: float
 ) -> Float:
-    """Discrete Frechet distances of all pairs of one kind, in the better direction.
+    """Discrete Frechet distances of all pairs of one kind, in the better direction, metres: ``(n, m)``.
 
-    Args:
-        predicted: ``(n, p, 2) float64``, resampled lines, metres; a ring repeats its first point at the end.
-        predicted_kinds: ``(n,)``.
-        truths: ``(m, p, 2) float64``.
-        truth_kinds: ``(m,)``.
-        limit: pairs that are farther apart than this, metres, are not computed to the end.
-
-    Returns:
-        ``(n, m) float64``, metres; infinite for pairs of different kinds and for pairs beyond ``limit``.
+    Lines are ``(n, p, 2)`` and ``(m, p, 2) float64``; a ring repeats its first point at the end. Infinite for pairs of
+    different kinds and for those beyond ``limit``, which are not computed to the end.
     """
     rings = np.isin(predicted_kinds, [kind for kind in ElementKind if kind.is_ring])
     matrix: Float = _matrix(predicted, predicted_kinds, truths, truth_kinds, rings, limit)

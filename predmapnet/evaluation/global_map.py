@@ -9,18 +9,18 @@ whole elements are counted inside the union of the regions of interest along the
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
 from mapfusion.geometry import chamfer_distance, transform_points
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_distance import match_greedily
-from predmapnet.evaluation.precision_recall import AveragePrecision, accumulate
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate
 
 THRESHOLDS = (0.5, 1.0, 1.5)
 """Metres."""
@@ -103,14 +103,12 @@ class GlobalMapQuality:
     Attributes:
         kinds: one entry per :class:`mapfusion.ElementKind`.
         elements: average precision of whole elements by chamfer distance, confidence as the score.
-        scores, flags, element_kinds: the input of ``elements``, for pooling.
+        matches: from which it comes, for pooling.
     """
 
     kinds: tuple[KindQuality, ...]
     elements: AveragePrecision
-    scores: Float
-    flags: NDArray[np.int8]
-    element_kinds: Integer
+    matches: Matches
 
     @property
     def overall(self) -> KindQuality:
@@ -130,15 +128,7 @@ class GlobalMapQuality:
 
 
 def seen_area(ego_to_global: Sequence[Float], roi: RegionOfInterest) -> shapely.Geometry:
-    """Union of the regions of interest along a drive.
-
-    Args:
-        ego_to_global: ``(4, 4)`` poses.
-        roi: the region that is mapped at each of them.
-
-    Returns:
-        Polygon or multipolygon in the global frame, metres.
-    """
+    """Return the union of the regions of interest along a drive of ``(4, 4)`` poses, global frame, metres."""
     corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * roi.size / 2
     rectangles = [shapely.Polygon(transform_points(pose, corners)) for pose in ego_to_global]
     return shapely.union_all(rectangles)
@@ -147,22 +137,16 @@ def seen_area(ego_to_global: Sequence[Float], roi: RegionOfInterest) -> shapely.
 def global_map_quality(
     predicted: GlobalMap, truth: GlobalMap, seen: shapely.Geometry | None = None
 ) -> GlobalMapQuality:
-    """Measure a global map against the true one.
+    """Measure a global map against the true one in the same frame, not clipped; confidences are the scores.
 
-    Args:
-        predicted: the map; the confidence of an element is its score.
-        truth: the true map in the same global frame, not clipped.
-        seen: area in which truth counts (see :func:`seen_area`); everywhere if None.
-
-    Returns:
-        Counts and figures per kind and overall.
+    Truth counts inside ``seen`` (see :func:`seen_area`); everywhere if that is None.
 
     Raises:
         UserError: an element holds NaN or infinite coordinates; the message names it.
     """
     _check_finite("predicted", predicted)
     _check_finite("true", truth)
-    results, kinds, scores, flags, truths = [], [], [], [], []
+    results, matches = [], []
     for kind in ElementKind:
         # A line without two points has no length and cannot be right, but it still counts as an element.
         elements = predicted.of_kind(kind)
@@ -170,40 +154,26 @@ def global_map_quality(
         confidence = np.array([element.confidence for element in elements], dtype=np.float64)
         unclipped = [element.points for element in truth.of_kind(kind)]
         clipped = _clip(unclipped, kind, seen)
-        quality, kind_flags = _kind_quality(lines, confidence, unclipped, clipped, seen)
-        results.append(quality)
-        kinds.append(np.full(len(lines), int(kind), dtype=np.int64))
-        scores.append(confidence)
-        flags.append(kind_flags)
-        truths.append(len(clipped))
-    return GlobalMapQuality(
-        tuple(results),
-        accumulate(kinds, scores, flags, truths, THRESHOLDS),
-        np.concatenate(scores),
-        np.concatenate(flags),
-        np.concatenate(kinds),
-    )
+        results.append(_kind_quality(lines, confidence, unclipped, clipped, seen))
+        matched = match_greedily(_chamfer(lines, clipped), confidence, THRESHOLDS)
+        kinds, true_kinds = (np.full(len(some), int(kind), dtype=np.int64) for some in (lines, clipped))
+        matches.append(Matches.of(kinds, confidence, matched, true_kinds))
+    return _quality(results, matches)
 
 
 def pool(qualities: Sequence[GlobalMapQuality]) -> GlobalMapQuality:
     """Pool the maps of several scenes: lengths and counts add up, elements are ranked together."""
-    scores = [quality.scores for quality in qualities]
-    flags = [quality.flags for quality in qualities]
-    element_kinds = [quality.element_kinds for quality in qualities]
-    kinds = tuple(_sum([quality.kinds[kind] for quality in qualities]) for kind in ElementKind)
-    truths = [kind.true_elements for kind in kinds]
-    return GlobalMapQuality(
-        kinds,
-        accumulate(element_kinds, scores, flags, truths, THRESHOLDS),
-        np.concatenate([np.zeros(0), *scores]),
-        np.concatenate([np.zeros((0, len(THRESHOLDS)), dtype=np.int8), *flags]),
-        np.concatenate([np.zeros(0, dtype=np.int64), *element_kinds]),
-    )
+    kinds = [_sum([quality.kinds[kind] for quality in qualities]) for kind in ElementKind]
+    return _quality(kinds, [quality.matches for quality in qualities])
+
+
+def _quality(kinds: Sequence[KindQuality], matches: Sequence[Matches]) -> GlobalMapQuality:
+    return GlobalMapQuality(tuple(kinds), accumulate(matches, THRESHOLDS), Matches.together(matches, len(THRESHOLDS)))
 
 
 def _kind_quality(
     lines: list[Float], confidence: Float, unclipped: list[Float], clipped: list[Float], seen: shapely.Geometry | None
-) -> tuple[KindQuality, NDArray[np.int8]]:
+) -> KindQuality:
     predicted_samples, predicted_weight, predicted_owner = _sample(lines)
     true_samples, true_weight, _ = _sample(unclipped)
     if seen is not None and len(true_samples):
@@ -211,11 +181,10 @@ def _kind_quality(
         inside = shapely.contains_xy(seen, true_samples)
         true_samples, true_weight = true_samples[inside], true_weight[inside]
     # What is predicted outside the seen area is right or wrong by the unclipped truth.
-    error = _distance(predicted_samples, unclipped)
-    miss = _distance(true_samples, lines)
+    error, _ = _nearest(predicted_samples, unclipped)
+    miss, _ = _nearest(true_samples, lines)
     fragments, followed, duplicates = _follow(predicted_samples, predicted_owner, confidence, clipped)
-    matched = match_greedily(_chamfer(lines, clipped), confidence, THRESHOLDS)
-    quality = KindQuality(
+    return KindQuality(
         right=np.array([predicted_weight[error <= threshold].sum() for threshold in THRESHOLDS]),
         found=np.array([true_weight[miss <= threshold].sum() for threshold in THRESHOLDS]),
         predicted=float(predicted_weight.sum()),
@@ -227,7 +196,6 @@ def _kind_quality(
         predicted_elements=len(lines),
         true_elements=len(clipped),
     )
-    return quality, (matched >= 0).astype(np.int8)
 
 
 def _sample(lines: Sequence[Float]) -> tuple[Float, Float, Integer]:
@@ -261,10 +229,6 @@ def _nearest(samples: Float, lines: Sequence[Float]) -> tuple[Float, Integer]:
     )
     distance[rows], owner[rows] = distances, owners[hits]
     return distance, owner
-
-
-def _distance(samples: Float, lines: Sequence[Float]) -> Float:
-    return _nearest(samples, lines)[0]
 
 
 def _follow(samples: Float, owner: Integer, confidence: Float, truths: list[Float]) -> tuple[int, int, int]:
@@ -341,18 +305,9 @@ def _check_finite(which: str, vector_map: GlobalMap) -> None:
 
 def _sum(qualities: Iterable[KindQuality]) -> KindQuality:
     parts = list(qualities)
-    return KindQuality(
-        right=sum((part.right for part in parts), np.zeros(len(THRESHOLDS))),
-        found=sum((part.found for part in parts), np.zeros(len(THRESHOLDS))),
-        predicted=sum(part.predicted for part in parts),
-        true=sum(part.true for part in parts),
-        lateral_errors=np.concatenate([np.zeros(0), *(part.lateral_errors for part in parts)]),
-        fragments=sum(part.fragments for part in parts),
-        followed=sum(part.followed for part in parts),
-        duplicates=sum(part.duplicates for part in parts),
-        predicted_elements=sum(part.predicted_elements for part in parts),
-        true_elements=sum(part.true_elements for part in parts),
-    )
+    names = [each.name for each in fields(KindQuality) if each.name != "lateral_errors"]
+    totals: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names}
+    return KindQuality(**totals, lateral_errors=np.concatenate([part.lateral_errors for part in parts]))
 
 
 def _ratio(part: Float, whole: float) -> Float:

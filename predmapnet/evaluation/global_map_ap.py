@@ -17,21 +17,17 @@ import numpy as np
 import shapely
 
 from mapfusion.arrays import Float
-from mapfusion.elements import ElementKind, GlobalMap
-from predmapnet.evaluation.chamfer_distance import POINTS_PER_LINE, chamfer_matrix, match_greedily, resample_all
+from mapfusion.elements import GlobalMap
+from predmapnet.evaluation.chamfer_ap import chamfer_matches
 from predmapnet.evaluation.precision_recall import Matches
 
 
 def global_map_matches(
     predicted: GlobalMap, truth: GlobalMap, seen: shapely.Geometry, thresholds: Sequence[float]
 ) -> Matches:
-    """Match the elements of a global map.
+    """Match the elements of a global map to the true ones inside ``seen``; confidences are the scores.
 
-    Args:
-        predicted: the map; the confidence of an element is its score.
-        truth: the true map in the same global frame.
-        seen: area in which truth counts, see :func:`predmapnet.evaluation.global_map.seen_area`.
-        thresholds: chamfer distances, metres.
+    Both maps are in the same global frame; thresholds are chamfer distances, metres.
     """
     elements = tuple(predicted)
     kinds = np.array([element.kind for element in elements], dtype=np.int64)
@@ -40,15 +36,8 @@ def global_map_matches(
     true_kinds = np.array([kind for kind, _ in pieces], dtype=np.int64)
     # Distances are differences of small numbers: far from the origin, float64 would lose digits.
     middle = np.array(seen.centroid.coords[0]) if not seen.is_empty else np.zeros(2)
-    matrix = chamfer_matrix(
-        resample_all([element.points - middle for element in elements], POINTS_PER_LINE),
-        kinds,
-        resample_all([piece - middle for _, piece in pieces], POINTS_PER_LINE),
-        true_kinds,
-        limit=max(thresholds),
-    )
-    flags = (match_greedily(matrix, scores, thresholds) >= 0).astype(np.int8)
-    return Matches(kinds, scores, flags, np.bincount(true_kinds, minlength=len(ElementKind)))
+    lines = [element.points - middle for element in elements]
+    return chamfer_matches(kinds, scores, lines, true_kinds, [piece - middle for _, piece in pieces], thresholds)
 
 
 def _inside(points: Float, seen: shapely.Geometry) -> list[Float]:

@@ -46,10 +46,10 @@ class IdentityCounts:
 def count_identities(
     frames: Sequence[EvaluationFrame], truth_ids: Sequence[Integer], matched: Sequence[Integer]
 ) -> IdentityCounts:
-    """Follow the true tracks of one scene through the predictions.
+    """Follow the true tracks of one scene through the predictions of its frames in order.
 
     Args:
-        frames: all frames of the scene in order.
+        frames: of the scene.
         truth_ids: per frame ``(m,)`` track ids of the truths, unique per kind.
         matched: per frame ``(n,)`` track id of the truth that each prediction finds, or -1.
     """

@@ -10,15 +10,15 @@ from mapfusion.arrays import Integer
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.errors import UserError
 from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
-from predmapnet.evaluation.chamfer_ap import chamfer_from_flags, frame_flags, thresholds_for
-from predmapnet.evaluation.consistency_ap import Flags, consistency_flags, matched_tracks, with_formed_tracks
+from predmapnet.evaluation.chamfer_ap import frame_matches, thresholds_for
+from predmapnet.evaluation.consistency_ap import consistency_matches, matched_tracks, with_formed_tracks
 from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
 from predmapnet.evaluation.frames import EvaluationFrame
-from predmapnet.evaluation.frechet_ap import FRECHET_THRESHOLDS, frechet_flags
+from predmapnet.evaluation.frechet_ap import FRECHET_THRESHOLDS, frechet_matches
 from predmapnet.evaluation.global_map import GlobalMapQuality, global_map_quality, pool, seen_area
 from predmapnet.evaluation.global_map_ap import global_map_matches
 from predmapnet.evaluation.identity import IdentityCounts, count_identities, pool_identities
-from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate_matches
+from predmapnet.evaluation.precision_recall import AveragePrecision, Matches, accumulate
 from predmapnet.evaluation.raster_ap import (
     RasterAveragePrecision,
     RasterMatches,
@@ -38,13 +38,13 @@ class SceneMeasurement:
     Attributes:
         frames: the frames that were measured, in order.
         thresholds: chamfer thresholds, metres.
-        chamfer: per frame true-positive flags.
+        chamfer: matches, per frame.
         frechet: the same by the order-aware distance.
-        ahead, rear: per frame the matches of each half of the region.
-        raster: per frame matches by overlap.
-        tracked, tracked_unanchored: per frame flags of C-mAP with the ids that the predictions carry, and the same
-            without asking for consistency.
-        formed_frames, formed: frames with ids formed from the predictions, and their flags.
+        ahead, rear: those of each half of the region.
+        raster: matches by overlap, per frame.
+        tracked, tracked_unanchored: matches of C-mAP with the ids that the predictions carry, and the same without
+            asking for consistency.
+        formed: those with ids formed from the predictions.
         identity: id switches and track lengths.
         forecast: errors of the forecasts.
         protocol, instances: of the stability.
@@ -52,19 +52,19 @@ class SceneMeasurement:
         mapping_seconds: wall time of mapping; None where results were read.
         absent_frames: frames that the results lack, measured as empty ones.
         weights_sha256: of the weights that made the maps; None where unknown.
+        maps: the map of the drive and the true one, for drawings; None where one is missing.
     """
 
     frames: tuple[EvaluationFrame, ...]
     thresholds: tuple[float, ...]
-    chamfer: list[Flags]
-    frechet: list[Flags]
+    chamfer: list[Matches]
+    frechet: list[Matches]
     ahead: list[Matches]
     rear: list[Matches]
     raster: list[tuple[RasterMatches, ...]]
-    tracked: list[Flags]
-    tracked_unanchored: list[Flags]
-    formed_frames: list[EvaluationFrame]
-    formed: list[Flags]
+    tracked: list[Matches]
+    tracked_unanchored: list[Matches]
+    formed: list[Matches]
     identity: IdentityCounts
     forecast: ForecastErrors
     protocol: Protocol
@@ -74,6 +74,7 @@ class SceneMeasurement:
     mapping_seconds: float | None = None
     absent_frames: int = 0
     weights_sha256: str | None = None
+    maps: tuple[GlobalMap, GlobalMap] | None = None
 
 
 @dataclass(frozen=True)
@@ -165,17 +166,7 @@ def measure_scene(
     mapping_seconds: float | None = None,
     protocol: Protocol = Protocol.ANCHORED,
 ) -> SceneMeasurement:
-    """Measure one scene.
-
-    Args:
-        frames: all frames of the scene in order.
-        global_map, truth_map: maps of the whole drive in the same global frame, if both exist.
-        mapping_seconds: wall time that mapping took, carried along.
-        protocol: of the stability.
-
-    Raises:
-        UserError: the scene has no frame.
-    """
+    """Measure one scene: all of its frames (at least one) in order, and its maps in one frame where both exist."""
     if not frames:
         raise UserError("There is no frame to measure.")
     roi = frames[0].predicted.roi
@@ -191,15 +182,14 @@ def measure_scene(
     return SceneMeasurement(
         frames=tuple(frames),
         thresholds=thresholds,
-        chamfer=[frame_flags(frame, thresholds) for frame in frames],
-        frechet=[frechet_flags(frame) for frame in frames],
+        chamfer=[frame_matches(frame, thresholds) for frame in frames],
+        frechet=[frechet_matches(frame) for frame in frames],
         ahead=[half_matches(frame, Half.AHEAD, thresholds) for frame in frames],
         rear=[half_matches(frame, Half.REAR, thresholds) for frame in frames],
         raster=[raster_matches(frame) for frame in frames],
-        tracked=consistency_flags(frames, matched),
-        tracked_unanchored=consistency_flags(frames, matched, anchored=False),
-        formed_frames=formed_frames,
-        formed=consistency_flags(formed_frames, matched_tracks(formed_frames, truth_ids, thresholds)),
+        tracked=consistency_matches(frames, matched),
+        tracked_unanchored=consistency_matches(frames, matched, anchored=False),
+        formed=consistency_matches(formed_frames, matched_tracks(formed_frames, truth_ids, thresholds)),
         identity=count_identities(frames, truth_ids, [found[:, -1] for found in matched]),
         forecast=forecast_errors(frames),
         protocol=protocol,
@@ -211,10 +201,9 @@ def measure_scene(
 
 
 def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
-    """Pool scenes; their order breaks ties of scores.
+    """Pool scenes (at least one); their order breaks ties of scores.
 
-    Raises:
-        UserError: there is no scene, or the scenes were mapped with different regions of interest or weights.
+    Raises UserError where they were mapped with different regions of interest or weights.
     """
     if not scenes:
         raise UserError("There is no scene to measure.")
@@ -225,38 +214,33 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
     thresholds = scenes[0].thresholds
     frames = [frame for scene in scenes for frame in scene.frames]
     maps = [scene.global_map for scene in scenes if scene.global_map is not None]
-    matches = [scene.global_matches for scene in scenes if scene.global_matches is not None]
+    global_matches = [scene.global_matches for scene in scenes if scene.global_matches is not None]
     seconds = [scene.mapping_seconds for scene in scenes if scene.mapping_seconds is not None]
+
+    def pooled(name: str, at: Sequence[float] = thresholds) -> AveragePrecision:
+        matches: list[Matches] = [match for scene in scenes for match in getattr(scene, name)]
+        return accumulate(matches, at)
+
     return Measurement(
         scenes=tuple(scene.frames[0].scene for scene in scenes),
         frames=tuple(frames),
-        chamfer=chamfer_from_flags(frames, _flat([scene.chamfer for scene in scenes]), thresholds),
-        frechet=chamfer_from_flags(frames, _flat([scene.frechet for scene in scenes]), FRECHET_THRESHOLDS),
-        ahead=accumulate_matches([match for scene in scenes for match in scene.ahead], thresholds),
-        rear=accumulate_matches([match for scene in scenes for match in scene.rear], thresholds),
+        chamfer=pooled("chamfer"),
+        frechet=pooled("frechet", FRECHET_THRESHOLDS),
+        ahead=pooled("ahead"),
+        rear=pooled("rear"),
         raster=raster_from_matches([match for scene in scenes for match in scene.raster]),
-        consistency=chamfer_from_flags(frames, _flat([scene.tracked for scene in scenes]), thresholds),
-        consistency_unanchored=chamfer_from_flags(
-            frames, _flat([scene.tracked_unanchored for scene in scenes]), thresholds
-        ),
-        formed_consistency=chamfer_from_flags(
-            [frame for scene in scenes for frame in scene.formed_frames],
-            _flat([scene.formed for scene in scenes]),
-            thresholds,
-        ),
+        consistency=pooled("tracked"),
+        consistency_unanchored=pooled("tracked_unanchored"),
+        formed_consistency=pooled("formed"),
         identity=pool_identities([scene.identity for scene in scenes]),
         forecast=pool_forecasts([scene.forecast for scene in scenes]),
         stability=stability([(scene.frames, scene.instances) for scene in scenes], scenes[0].protocol),
         global_map=pool(maps) if len(maps) == len(scenes) else None,
-        global_map_ap=accumulate_matches(matches, thresholds) if len(matches) == len(scenes) else None,
+        global_map_ap=accumulate(global_matches, thresholds) if len(global_matches) == len(scenes) else None,
         frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
         absent_frames=sum(scene.absent_frames for scene in scenes),
         weights_sha256=scenes[0].weights_sha256,
     )
-
-
-def _flat(flags: Sequence[list[Flags]]) -> list[Flags]:
-    return [entry for scene in flags for entry in scene]
 
 
 def _element_ids(frames: Sequence[EvaluationFrame], track_ids: Sequence[Integer]) -> list[Integer]:

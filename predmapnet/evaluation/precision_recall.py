@@ -16,12 +16,9 @@ _EPSILON = float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True)
 class PrecisionRecallCurve:
-    """Precision over recall of one kind at one threshold, in descending score.
+    """Precision over recall of one kind at one threshold (metres), one entry per prediction in descending score.
 
-    Attributes:
-        threshold: metres.
-        scores, precision, recall: ``(n,) float64``, one entry per prediction.
-        average_precision: area under the monotone envelope of the curve.
+    The average precision is the area under the monotone envelope of the curve.
     """
 
     threshold: float
@@ -33,13 +30,7 @@ class PrecisionRecallCurve:
 
 @dataclass(frozen=True)
 class KindResult:
-    """Average precision of one kind.
-
-    Attributes:
-        kind: of the elements.
-        curves: one per threshold.
-        truths, predictions: numbers of elements.
-    """
+    """Average precision of one kind, with one curve per threshold and the numbers of elements."""
 
     kind: ElementKind
     curves: tuple[PrecisionRecallCurve, ...]
@@ -90,7 +81,7 @@ class Matches:
     Attributes:
         kinds: ``(n,)`` of the predictions.
         scores: ``(n,)``.
-        flags: ``(n, thresholds) int8``: 1 true positive, 0 false positive.
+        flags: ``(n, thresholds) int8``: 1 true positive, 0 false positive, -1 not counted.
         truths: ``(3,)`` number of true elements per kind.
     """
 
@@ -99,17 +90,38 @@ class Matches:
     flags: NDArray[np.int8]
     truths: Integer
 
+    @classmethod
+    def of(cls, kinds: Integer, scores: Float, matched: Integer, true_kinds: Integer) -> Matches:
+        """Return the matches of :func:`~predmapnet.evaluation.chamfer_distance.match_greedily`."""
+        return cls(kinds, scores, (matched >= 0).astype(np.int8), np.bincount(true_kinds, minlength=len(ElementKind)))
 
-def accumulate_matches(matches: Sequence[Matches], thresholds: Sequence[float]) -> AveragePrecision:
-    """Collect the matches of all frames or maps into average precisions; their order decides equal scores."""
-    truths = np.sum([np.zeros(len(ElementKind), dtype=np.int64), *(part.truths for part in matches)], axis=0)
-    return accumulate(
-        [part.kinds for part in matches],
-        [part.scores for part in matches],
-        [part.flags for part in matches],
-        truths.tolist(),
-        thresholds,
-    )
+    @classmethod
+    def together(cls, parts: Sequence[Matches], thresholds: int) -> Matches:
+        """Return the matches of all parts, one after the other, at so many thresholds."""
+        return cls(
+            np.concatenate([np.zeros(0, dtype=np.int64), *(part.kinds for part in parts)]),
+            np.concatenate([np.zeros(0), *(part.scores for part in parts)]),
+            np.concatenate([np.zeros((0, thresholds), dtype=np.int8), *(part.flags for part in parts)]),
+            np.sum([np.zeros(len(ElementKind), dtype=np.int64), *(part.truths for part in parts)], axis=0),
+        )
+
+
+def accumulate(matches: Sequence[Matches], thresholds: Sequence[float]) -> AveragePrecision:
+    """Collect the matches of all frames or maps into average precisions; their order decides equal scores.
+
+    There is a result for every kind, also for one that never occurs (AP 0).
+    """
+    every = Matches.together(matches, len(thresholds))
+    results = []
+    for kind in ElementKind:
+        counted, truths = (every.kinds == kind) & (every.flags[:, 0] >= 0), int(every.truths[kind])
+        curves = tuple(
+            precision_recall(every.scores[counted], every.flags[counted, column] == 1, truths, float(threshold))
+            for column, threshold in enumerate(thresholds)
+        )
+        results.append(KindResult(kind, curves, truths, int(counted.sum())))
+    flags = tuple(part.flags for part in matches)
+    return AveragePrecision(tuple(float(value) for value in thresholds), tuple(results), flags)
 
 
 def precision_recall(
@@ -117,15 +129,8 @@ def precision_recall(
 ) -> PrecisionRecallCurve:
     """Sort by score (stable) and accumulate.
 
-    Args:
-        scores: ``(n,)``, in the order that decides ties.
-        true_positive: ``(n,) bool``.
-        truths: number of ground-truth elements, found or not.
-        threshold: metres, carried along.
-
-    Returns:
-        The curve with its average precision: the sum, over the recalls that are reached, of the step in recall
-        times the best precision at that recall or beyond.
+    The average precision is the sum, over the recalls that are reached, of the step in recall times the best precision
+    at that recall or beyond; ``truths`` is the number of true elements, found or not.
     """
     order = np.argsort(-scores, kind="stable")
     hits = np.cumsum(true_positive[order], dtype=np.float64)
@@ -135,36 +140,3 @@ def precision_recall(
     envelope = np.maximum.accumulate(precision[::-1])[::-1]
     area = float(np.sum(np.diff(recall, prepend=0.0) * envelope))
     return PrecisionRecallCurve(threshold, scores[order], precision, recall, area)
-
-
-def accumulate(
-    kinds: Sequence[NDArray[np.int64]],
-    scores: Sequence[Float],
-    flags: Sequence[NDArray[np.int8]],
-    truths: Sequence[int],
-    thresholds: Sequence[float],
-) -> AveragePrecision:
-    """Collect the flags of all frames into average precisions.
-
-    Args:
-        kinds: per frame ``(n,)`` kinds of the predictions.
-        scores: per frame ``(n,)``.
-        flags: per frame ``(n, thresholds)``: 1 true positive, 0 false positive, -1 not counted.
-        truths: number of ground-truth elements per kind.
-        thresholds: metres.
-
-    Returns:
-        Results for every kind, also for one that never occurs (AP 0).
-    """
-    all_kinds = np.concatenate([np.zeros(0, dtype=np.int64), *kinds])
-    all_scores = np.concatenate([np.zeros(0), *scores])
-    all_flags = np.concatenate([np.zeros((0, len(thresholds)), dtype=np.int8), *flags])
-    results = []
-    for kind in ElementKind:
-        counted = (all_kinds == kind) & (all_flags[:, 0] >= 0)
-        curves = tuple(
-            precision_recall(all_scores[counted], all_flags[counted, column] == 1, truths[kind], float(threshold))
-            for column, threshold in enumerate(thresholds)
-        )
-        results.append(KindResult(kind, curves, truths[kind], int(counted.sum())))
-    return AveragePrecision(tuple(float(value) for value in thresholds), tuple(results), tuple(flags))

@@ -108,12 +108,7 @@ class RasterAveragePrecision:
 
 
 def raster_average_precision(frames: Sequence[EvaluationFrame], axes: Axes = "mapvr") -> RasterAveragePrecision:
-    """Rasterisation AP of the predictions of all frames together.
-
-    Args:
-        frames: in the order that decides equal scores.
-        axes: orientation of the canvas.
-    """
+    """Rasterisation AP of the predictions of all frames together, in the order that decides equal scores."""
     return raster_from_matches([raster_matches(frame, axes) for frame in frames])
 
 

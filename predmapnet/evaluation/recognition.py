@@ -1,4 +1,4 @@
-"""What results are of: the region of their elements, the split of their scenes, and what a reader must know of both."""
+"""Recognition of results: the region of their elements, the split of their scenes, and warnings of both."""
 
 from __future__ import annotations
 
@@ -27,14 +27,9 @@ _OVERLAP = {
 
 
 def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
-    """Recognise the region for which elements were made.
+    """Recognise the region for which elements (``(k, 2)`` each, metres, ego frame) were made.
 
-    Args:
-        path: of the results, for messages.
-        polylines: all elements of all frames, ``(k, 2)`` each, metres, ego frame.
-
-    Raises:
-        UserError: the axes are not x forward and y left, or the elements fit neither region of the benchmarks.
+    Raises UserError where the axes are not x forward and y left, or they fit neither region of the benchmarks.
     """
     if not polylines:
         return STANDARD
@@ -58,11 +53,7 @@ def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
 
 
 def check_region(path: Path, polylines: Sequence[Float], roi: RegionOfInterest) -> None:
-    """Refuse a region that the elements contradict: a wide region without anything outside the standard one is fine.
-
-    Raises:
-        UserError: many vertices lie outside ``roi``.
-    """
+    """Raise UserError for a region that many vertices contradict; a wide one without anything far outside is fine."""
     share = _beyond(np.abs(np.concatenate(polylines)), roi) if polylines else 0.0
     if share >= MANY:
         raise UserError(
@@ -80,17 +71,9 @@ def frames_look_like(names: Iterable[str]) -> str | None:
 
 
 def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, int]:
-    """Recognise the split of scenes.
+    """Recognise the split of the scenes that are measured; returns it, and how many scenes the data set has of it.
 
-    Args:
-        infos: all scenes of the data set.
-        scenes: names of those that are measured.
-
-    Returns:
-        The split, and the number of its scenes.
-
-    Raises:
-        UserError: the scenes belong to several splits.
+    Raises UserError for scenes of several splits.
     """
     of = {info.name: info.split for info in infos}
     measured = [of[name] for name in scenes]
@@ -107,12 +90,8 @@ def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, in
 def warnings_of(dataset: str, scheme: str, split: str, measured: int, in_split: int) -> list[str]:
     """Return what a reader of the figures must know of the scenes.
 
-    Args:
-        dataset: ``nuscenes``, ``argoverse2`` or ``demo``.
-        scheme: ``old`` or ``new``.
-        split: of the scenes.
-        measured: number of scenes.
-        in_split: number of scenes that the split has here.
+    Of ``dataset`` (``nuscenes``, ``argoverse2`` or ``demo``), by the ``old`` or ``new`` scheme of splits, ``measured``
+    scenes are, of as many as its split has here.
     """
     found = []
     if split == "train":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -9,27 +10,25 @@ from typing import Any
 
 import numpy as np
 import orjson
+import shapely
 
 import predmapnet
-from mapfusion.elements import ElementKind
+from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from predmapnet.evaluation.measurement import Measurement
 from predmapnet.evaluation.precision_recall import KindResult
 from predmapnet.evaluation.report_drawings import COLOURS, draw_bars, draw_curves, draw_frame
 from predmapnet.evaluation.scene_figures import SCENE_FIGURES
 from predmapnet.files import write_file
+from predmapnet.report.drawn_map import DrawnElement
+from predmapnet.report.page import Cell, Column, city_sheet, number, page, sortable_table, tiles
+from predmapnet.report.places import Place, side_by_side
 
 WORST_FRAMES = 8
 SHOWN_SCORE = 0.4
 """Untracked predictions below this score are not drawn and do not make a frame bad."""
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 1100px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-table { border-collapse: collapse; } td, th { padding: .2rem .8rem; text-align: right; }
-td:first-child, th:first-child { text-align: left; } th { border-bottom: 1px solid #9aa5b1; font-weight: 600; }
-figure { display: inline-block; margin: .5rem 1rem .5rem 0; } figcaption { font-size: .85rem; color: #52606d; }
-.wide { overflow-x: auto; font-size: .85rem; } .note { color: #52606d; } svg { background: #fff; }
-"""
+TRUTH_MARGIN = 20.0
+"""Ground truth is drawn up to this far beyond the bounds of a map, metres."""
 
 
 def write_figures(path: Path, figures: Mapping[str, Any], context: Mapping[str, Any]) -> None:
@@ -54,8 +53,9 @@ def write_report(
     context: Mapping[str, Any],
     per_scene: Mapping[str, Mapping[str, float | int | None]],
     origin: Mapping[str, str],
+    maps: Mapping[str, tuple[GlobalMap, GlobalMap]] | None = None,
 ) -> None:
-    """Write the HTML report: tables, precision-recall curves, AP per threshold, worst frames beside the truth.
+    """Write the HTML report: drawn maps, tables, precision-recall curves, AP per threshold, worst frames.
 
     Args:
         path: the file; its folder exists.
@@ -63,6 +63,7 @@ def write_report(
         context: ``dataset``, ``split``, ``synthetic``, ``warnings``.
         per_scene: see :func:`predmapnet.evaluation.scene_figures.scene_figures`.
         origin: how the figures were made, by name: date, weights, command.
+        maps: by scene the map of the drive and the true one, metres.
 
     Raises:
         UserError: the file cannot be written.
@@ -70,19 +71,21 @@ def write_report(
     what = f"{context['dataset']}{', split ' + str(context['split']) if context['split'] else ''}"
     counts = f"{len(measurement.scenes)} scenes, {len(measurement.frames)} frames"
     synthetic = " The demo world is synthetic." if context["synthetic"] else ""
+    figures = measurement.figures()
+    worst_first = sorted(per_scene, key=lambda name: _worth(per_scene[name]))
     parts = [
-        f"<h1>PredMapNet on {escape(what)}</h1>",
         f'<p class="note">{counts}, predmapnet {predmapnet.__version__}.{synthetic}</p>',
         *(f'<p class="note">{escape(name)}: <code>{escape(text)}</code></p>' for name, text in origin.items()),
-        *(f"<p>Note: {escape(text)}.</p>" for text in (*context["warnings"], *measurement.missing())),
-        _legend(),
+        *(f'<p class="warning">{escape(text)}</p>' for text in (*context["warnings"], *measurement.missing())),
+        tiles(_headline(figures)),
+        *([_drawn_maps([name for name in worst_first if name in maps], maps)] if maps else []),
         "<h2>Figures</h2>",
-        _figures_table(measurement.figures()),
+        _figures_table(figures),
         "<h2>Scenes, the worst first</h2>",
-        _scenes_table(per_scene),
+        _scenes_table(worst_first, per_scene, list(maps or ())),
         "<h2>Precision over recall, chamfer AP</h2>",
         *(_figure(draw_curves(kind.curves), _curve_caption(kind)) for kind in measurement.chamfer.kinds),
-        "<h2>AP per threshold</h2>",
+        f"<h2>AP per threshold</h2>{_legend()}",
         _figure(
             draw_bars(
                 [f"{threshold:g} m" for threshold in measurement.chamfer.thresholds],
@@ -104,12 +107,53 @@ def write_report(
         f"{SHOWN_SCORE} and more); the car stands in the middle and drives to the right.</p>",
         *_worst(measurement),
     ]
-    html = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>PredMapNet on {escape(what)}</title>'
-        f"<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
-    )
     with write_file(path) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+        temporary.write_text(page(f"PredMapNet on {what}", parts), encoding="utf-8")
+
+
+def _worth(figures: Mapping[str, float | int | None]) -> float:
+    value = figures["chamfer_mAP"]
+    return 2.0 if value is None else value
+
+
+def _headline(figures: Mapping[str, Any]) -> list[tuple[str, str, bool]]:
+    """Return the figures that readers look for first."""
+    wanted = (
+        ("chamfer mAP", figures["chamfer_ap"]["mAP"]),
+        ("consistency mAP", figures["consistency_ap"]["mAP"]),
+        ("rasterisation mAP", figures["raster_ap"]["mAP"]),
+        ("map precision at 1.0 m", (figures["global_map"] or {}).get("precision@1.0")),
+        ("map recall at 1.0 m", (figures["global_map"] or {}).get("recall@1.0")),
+    )
+    return [(f"{value:.3f}", name, False) for name, value in wanted if value is not None]
+
+
+def _drawn_maps(scenes: Sequence[str], maps: Mapping[str, tuple[GlobalMap, GlobalMap]]) -> str:
+    """Draw the map of each drive over the truth around it, scenes side by side."""
+    places, pairs = [], []
+    for name in scenes:
+        found, truth = maps[name]
+        points = np.concatenate([element.points for element in (*found, *truth)] or [np.zeros((1, 2))])
+        if len(found):
+            points = np.concatenate([element.points for element in found])
+        low, high = points.min(axis=0) - TRUTH_MARGIN, points.max(axis=0) + TRUTH_MARGIN
+        places.append(Place(name, None, low, high, np.zeros(2)))
+        box = shapely.box(*low, *high)
+        pairs.append((found.elements, [part for element in truth for part in _cut(element, box)]))
+    places = side_by_side(places)
+    drawn = [
+        DrawnElement(element, place.shift, row, is_truth)
+        for row, (place, pair) in enumerate(zip(places, pairs, strict=True))
+        for is_truth, elements in ((True, pair[1]), (False, pair[0]))
+        for element in elements
+    ]
+    return city_sheet(places, drawn, scenes, None)
+
+
+def _cut(element: MapElement, box: shapely.Polygon) -> list[MapElement]:
+    parts = shapely.get_parts(shapely.intersection(shapely.LineString(element.points), box))
+    lines = [shapely.get_coordinates(part) for part in parts if part.geom_type == "LineString"]
+    return [MapElement(element.kind, points, 1.0, 1, 0, 0) for points in lines]
 
 
 def frame_f1(measurement: Measurement) -> list[float]:
@@ -126,7 +170,15 @@ def frame_f1(measurement: Measurement) -> list[float]:
 
 def _worst(measurement: Measurement) -> Iterable[str]:
     values = np.array(frame_f1(measurement))
-    rows = np.argsort(np.nan_to_num(values, nan=np.inf), kind="stable")[:WORST_FRAMES]
+    of_one_scene = -(-WORST_FRAMES // len(measurement.scenes))
+    taken: Counter[str] = Counter()
+    rows = []
+    for row in np.argsort(np.nan_to_num(values, nan=np.inf), kind="stable"):
+        scene = measurement.frames[row].scene
+        if taken[scene] < of_one_scene:
+            taken[scene] += 1
+            rows.append(row)
+    rows = rows[:WORST_FRAMES]
     threshold = measurement.chamfer.thresholds[len(measurement.chamfer.thresholds) // 2]
     for row in rows:
         frame = measurement.frames[row]
@@ -148,36 +200,36 @@ def _curve_caption(kind: KindResult) -> str:
 
 
 def _legend() -> str:
-    swatches = (
-        f'<span style="color:{COLOURS[kind]}">&#9632;</span> {kind.label.replace("_", " ")} ' for kind in ElementKind
-    )
+    swatches = (f'<span style="color:{COLOURS[kind]}">&#9632;</span> {kind.nouns} ' for kind in ElementKind)
     return f"<p>{''.join(swatches)}</p>"
 
 
 def _figures_table(figures: Mapping[str, Any]) -> str:
-    rows = ["<table><tr><th></th><th>all</th>" + "".join(f"<th>{kind.label}</th>" for kind in ElementKind) + "</tr>"]
+    columns = [Column("figure", text=True), Column("all"), *(Column(kind.nouns) for kind in ElementKind)]
+    rows = []
     for title, group, overall, each in _ROWS:
         section = figures[group]
         if section is not None:
             values = [section[overall], *(section[kind.label][each] for kind in ElementKind)]
-            rows.append(f"<tr><td>{title}</td>{_cells(values)}</tr>")
-    return "".join(rows) + "</table>"
+            rows.append([Cell(title), *(number(value, 3) for value in values)])
+    return sortable_table(columns, rows)
 
 
-def _scenes_table(per_scene: Mapping[str, Mapping[str, float | int | None]]) -> str:
+def _scenes_table(
+    scenes: Sequence[str], per_scene: Mapping[str, Mapping[str, float | int | None]], drawn: Sequence[str]
+) -> str:
     """One row per scene; kinds that a scene does not hold are left out of its means."""
-    headings = "".join(f"<th>{text}</th>" for text in ("scene", "frames", *SCENE_FIGURES.values()))
-
-    def worth(name: str) -> float:
-        value = per_scene[name]["chamfer_mAP"]
-        return 2.0 if value is None else value
-
+    columns = [Column("scene", text=True), Column("frames"), *(Column(text) for text in SCENE_FIGURES.values())]
     rows = [
-        f"<tr><td>{escape(name)}</td><td>{per_scene[name]['frames']}</td>"
-        f"{_cells([per_scene[name][key] for key in SCENE_FIGURES])}</tr>"
-        for name in sorted(per_scene, key=worth)
+        [
+            Cell(escape(name)),
+            number(per_scene[name]["frames"]),
+            *(number(per_scene[name][key], 3) for key in SCENE_FIGURES),
+        ]
+        for name in scenes
     ]
-    return f'<div class="wide"><table><tr>{headings}</tr>{"".join(rows)}</table></div>'
+    place = {name: row for row, name in enumerate(name for name in scenes if name in drawn)}
+    return sortable_table(columns, rows, "scenes", [place.get(name, -1) for name in scenes])
 
 
 _ROWS = (
@@ -197,7 +249,3 @@ _ROWS = (
     ("lateral error, 95 % (m)", "global_map", "lateral_p95_m", "lateral_p95_m"),
     ("predicted per true element", "global_map", "fragmentation", "fragmentation"),
 )
-
-
-def _cells(values: Sequence[float | None]) -> str:
-    return "".join(f"<td>{'–' if value is None else f'{value:.3f}'}</td>" for value in values)

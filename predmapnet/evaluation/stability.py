@@ -98,13 +98,9 @@ def scene_instances(
     protocol: Protocol = Protocol.ANCHORED,
     interval: int = INTERVAL,
 ) -> SceneInstances:
-    """Find the instances of one scene, the costly part.
+    """Find the instances of one scene, the costly part, in all of its frames in order.
 
-    Args:
-        frames: all frames of the scene in order.
-        truth_ids: per frame ``(g,)`` ids of the true elements, unique per kind; paired instances ignore them.
-        protocol: see :class:`Protocol`.
-        interval: frames from the previous to the current one.
+    ``truth_ids`` are per frame ``(g,)`` ids of the true elements, unique per kind; paired instances ignore them.
     """
     if protocol is Protocol.PAIRED:
         return paired_instances(frames, interval)
@@ -117,10 +113,10 @@ def stability(
     interval: int = INTERVAL,
     weight: float = LOCALISATION_WEIGHT,
 ) -> Stability:
-    """Compute the values of all instances.
+    """Compute the values of all instances: frames of each scene, in the data set's order, and what was found there.
 
     Args:
-        scenes: frames of each scene and their :func:`scene_instances`, in the order of the data set.
+        scenes: frames and their :func:`scene_instances`.
         protocol, interval: with which the instances were found.
         weight: of the localisation; the shape has the rest.
     """
@@ -137,7 +133,8 @@ def stability(
         poses_of = np.concatenate([none, *pairs])
         own, rows, kinds = (values[: len(poses_of)] for values in (own, rows, kinds))
     scores = _scores(frames, own, rows)
-    near, alike = localisation_and_shape(*_lines(frames, own, rows, protocol), _poses(frames), poses_of)
+    poses = np.array([frame.predicted.ego_to_global for frame in frames]).reshape(-1, 4, 4)
+    near, alike = localisation_and_shape(*_lines(frames, own, rows, protocol), poses, poses_of)
     there = presence(scores[:, 0], scores[:, 1])
     together = np.clip(weight * near + (1.0 - weight) * alike, 0.0, 1.0)
     return Stability(
@@ -178,7 +175,3 @@ def _lines(
 
 def _first_lines(frames: Sequence[EvaluationFrame]) -> Integer:
     return np.cumsum([0, *(len(frame.predicted) for frame in frames)])
-
-
-def _poses(frames: Sequence[EvaluationFrame]) -> Float:
-    return np.array([frame.predicted.ego_to_global for frame in frames]).reshape(-1, 4, 4)

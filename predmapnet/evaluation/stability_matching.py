@@ -55,12 +55,7 @@ def anchored_instances(
 
     Predictions of all classes and scores compete for the truths of a pair, in either frame apart, at the least total
     cost; there is no limit to the cost of a match. An element that clipping cut into ``k`` parts in one frame and
-    ``m`` in the other is ``k * m`` instances.
-
-    Args:
-        frames: all frames of the scene in order.
-        truth_ids: per frame ``(g,)`` ids of the truths, unique per kind.
-        interval: frames from the previous to the current one.
+    ``m`` in the other is ``k * m`` instances. ``truth_ids`` are per frame ``(g,)`` ids, unique per kind.
     """
     orders = [np.argsort(np.argsort(TRUTH_ORDER)[frame.truth.kinds], kind="stable") for frame in frames]
     costs = [_costs(frame) for frame in frames]
@@ -77,11 +72,7 @@ def anchored_instances(
 def paired_instances(frames: Sequence[EvaluationFrame], interval: int) -> SceneInstances:
     """Match the predictions of two frames to each other, within their class, by the best total localisation.
 
-    Frames without predictions are left out before frames are paired.
-
-    Args:
-        frames: all frames of the scene in order.
-        interval: frames with predictions from the previous to the current one.
+    Frames without predictions are left out before frames ``interval`` apart are paired.
     """
     held = [row for row, frame in enumerate(frames) if len(frame.predicted)]
     lines = {row: padded_lines(frames[row]) for row in held}
@@ -119,17 +110,9 @@ def padded_lines(frame: EvaluationFrame) -> list[Float]:
 def matching_costs(
     predicted: Float, kinds: Integer, scores: NDArray[np.float32], truths: Float, truth_kinds: Integer
 ) -> Float:
-    """Costs of assigning predictions to truths: class, box and points.
+    """Costs of assigning predictions ``(n, 50, 2)`` to truths ``(g, 50, 2)``: class, box and points, ``(n, g)``.
 
-    Args:
-        predicted: ``(n, 50, 2)``, resampled lines, metres.
-        kinds: ``(n,)``.
-        scores: ``(n,) float32``.
-        truths: ``(g, 50, 2)``.
-        truth_kinds: ``(g,)``.
-
-    Returns:
-        ``(n, g) float64``. Points of truths are normalised twice, as in the toolbox.
+    Points of truths are normalised twice, as in the toolbox.
     """
     range_ = np.array(MATCHING_RANGE)
     grown = np.exp(scores.astype(np.float64))

@@ -25,10 +25,9 @@ WINDOW = (30.0, 15.0)
 
 
 def presence(current_scores: NDArray[np.float32], previous_scores: NDArray[np.float32]) -> Float:
-    """Presence ``(m,)``: 0.2 for an instance that appears, 1 for all others, also for one that vanishes.
+    """Presence ``(m,)`` by two scores, 0 where nothing was matched: 0.2 for an instance that appears, else 1.
 
-    Args:
-        current_scores, previous_scores: ``(m,) float32``; 0 where nothing was matched.
+    That holds for one that vanishes, too.
     """
     appears = (current_scores >= PRESENCE_THRESHOLD) & (previous_scores <= PRESENCE_THRESHOLD)
     return np.where(appears, APPEARANCE, np.float32(1.0)).astype(np.float64)
@@ -37,7 +36,7 @@ def presence(current_scores: NDArray[np.float32], previous_scores: NDArray[np.fl
 def localisation_and_shape(
     points: Float, offsets: Integer, lines: Integer, poses: Float, frames: Integer
 ) -> tuple[Float, Float]:
-    """Compare pairs of lines.
+    """Compare pairs of lines: localisation and shape, ``(m,)`` each, in [0, 1].
 
     Args:
         points: ``(k, 2) float64``, vertices of all lines one after the other, metres, each in its own ego frame.
@@ -45,9 +44,6 @@ def localisation_and_shape(
         lines: ``(m, 2)`` current and previous line of each pair; -1 for none.
         poses: ``(f, 4, 4)`` ego to global.
         frames: ``(m, 2)`` rows of ``poses``: the current and the previous one of each pair.
-
-    Returns:
-        Localisation and shape, ``(m,)`` each, in [0, 1].
     """
     values: tuple[Float, Float] = _values(points, offsets, lines, np.ascontiguousarray(poses), frames)
     return values
@@ -56,14 +52,9 @@ def localisation_and_shape(
 def localisation_matrix(
     current: Float, current_offsets: Integer, previous: Float, previous_offsets: Integer
 ) -> NDArray[np.float32]:
-    """Localisation of every current line against every previous one, both in the same frame and without a window.
+    """Localisation ``(n, m) float32`` of every current line against every previous one, in one frame, without a window.
 
-    Args:
-        current, previous: ``(k, 2) float64``, vertices of all lines one after the other, metres.
-        current_offsets, previous_offsets: where each line begins, and the end.
-
-    Returns:
-        ``(n, m) float32``.
+    Vertices ``(k, 2)``, metres, come line after line; the offsets say where each line begins, and the end.
     """
     matrix: NDArray[np.float32] = _matrix(current, current_offsets, previous, previous_offsets).astype(np.float32)
     return matrix
@@ -105,11 +96,9 @@ def stations_of(line: Float) -> Float:  # pragma: no cover - compiled
 
 @njit(cache=True)
 def heights(line: Float, stations: Float) -> Float:  # pragma: no cover - compiled
-    """Walk along a line and read y at ascending x, never going back; only a line of ascending x is interpolated.
+    """Walk along a line ``(n, 2)`` and read y at ascending stations x, never going back.
 
-    Args:
-        line: ``(n, 2)``, ``n >= 1``.
-        stations: ``(s,)`` ascending.
+    Only a line of ascending x is interpolated.
     """
     last = len(line) - 1
     found = np.empty(len(stations))

@@ -74,10 +74,7 @@ class _Instant:
 
 
 def truth_track_ids(frames: Sequence[EvaluationFrame]) -> list[Integer]:
-    """Track ids of the ground truth of one scene, as the official code finds them.
-
-    Args:
-        frames: all frames of the scene in order; ``truth`` must not be simplified.
+    """Track ids of the ground truth of one scene, not simplified, as the official code finds them.
 
     Returns:
         Per frame ``(n,)`` ids, counted from 0 per kind.
@@ -93,12 +90,6 @@ def form_tracks(frames: Sequence[EvaluationFrame]) -> list[FormedTracks]:
 
     Predictions above a score of 0.4 look for a partner in each of the last five frames, nearest first, and take its
     id if it is still free.
-
-    Args:
-        frames: all frames of the scene in order.
-
-    Returns:
-        One entry per frame.
     """
     following = [0] * len(ElementKind)
     scene_ids: dict[tuple[int, int], int] = {}

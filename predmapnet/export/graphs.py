@@ -42,7 +42,7 @@ def padded_state(network: PredMapNet, rows: int) -> StreamState:
     def padded(values: Tensor, count: int = rows) -> Tensor:
         return values.new_zeros(1, count, *values.shape[2:])
 
-    memory = config.temporal_bev
+    memory = config.bev.memory
     if isinstance(memory, EncoderBevMemoryConfig):
         poses = torch.eye(4, dtype=torch.float64).repeat(1, memory.capacity, 1, 1)
         maps, valid = padded(state.bev_memory, memory.capacity), padded(state.bev_memory_valid, memory.capacity)

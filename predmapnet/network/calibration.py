@@ -53,11 +53,7 @@ class Calibration:
 
 
 def calibrate(rig: Rig, config: PredMapNetConfig) -> Calibration:
-    """Describe the cameras of one frame, in the order in which their images come.
-
-    Args:
-        rig: cameras at the size of their stored images; scaling and the window are taken care of here.
-        config: of the network.
+    """Describe the cameras of one frame, in the order in which their images come, as the network's input shows them.
 
     Raises:
         UserError: the network has a learned code for each camera, and none for one of these.

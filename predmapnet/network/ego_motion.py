@@ -11,11 +11,7 @@ from predmapnet.network.layers import cell_centres
 
 
 def relative_motion(a_to_global: Tensor, b_to_global: Tensor) -> Tensor:
-    """Motion of the ground plane from ego frame a to ego frame b.
-
-    Args:
-        a_to_global: ``(..., 4, 4) float64``.
-        b_to_global: ``(..., 4, 4) float64``.
+    """Return the motion of the ground from ego frame a to ego frame b, of poses ``(..., 4, 4) float64``.
 
     Returns:
         ``(..., 2, 3) float32``: rotation and translation (metres) that map x, y of frame a to frame b. Computed in
@@ -33,15 +29,12 @@ def plane_motion(a_to_b: Tensor) -> Tensor:
 
 
 def move_points(points: Tensor, a_to_b: Tensor, roi: RegionOfInterest) -> Tensor:
-    """Move normalised points to another ego frame.
+    """Move normalised points ``(B, ..., 2)`` from ego frame a to ego frame b; they may then lie outside [0, 1].
 
     Args:
-        points: ``(B, ..., 2)`` in frame a, normalised.
+        points: in frame a.
         a_to_b: ``(B, 2, 3)``, metres, in the precision of the points.
         roi: the region of both frames.
-
-    Returns:
-        ``(B, ..., 2)`` in frame b, normalised; points may lie outside [0, 1].
     """
     x, y = (points - 0.5).flatten(1, -2).unbind(-1)
     metres = torch.stack([x * roi.length, y * roi.width], dim=-1)
@@ -51,15 +44,12 @@ def move_points(points: Tensor, a_to_b: Tensor, roi: RegionOfInterest) -> Tensor
 
 
 def warp_bev(maps: Tensor, current_to_past: Tensor, roi: RegionOfInterest) -> Tensor:
-    """Show past BEV maps in the current ego frame, zeros where they do not reach.
+    """Show past BEV maps in the current ego frame, bilinearly at its cell centres; zeros where they do not reach.
 
     Args:
         maps: ``(M, C, H, W)``, in the past frame.
         current_to_past: ``(M, 2, 3)``, metres.
         roi: the region that the grid covers in both frames.
-
-    Returns:
-        ``(M, C, H, W)``, bilinearly interpolated at the cell centres of the current frame.
     """
     rows, columns = maps.shape[-2:]
     cells = cell_centres(rows, columns, maps.device).expand(len(maps), rows, columns, 2)
@@ -84,14 +74,7 @@ def relative_pose(a_to_global: Tensor, b_to_global: Tensor) -> Tensor:
 
 
 def quaternion(rotation: Tensor) -> Tensor:
-    """Turn rotation matrices into unit quaternions.
-
-    Args:
-        rotation: ``(..., 3, 3)``.
-
-    Returns:
-        ``(..., 4)`` as (x, y, z, w); the largest component is positive.
-    """
+    """Turn rotations ``(..., 3, 3)`` into unit quaternions ``(..., 4)``: x, y, z, w, the largest one positive."""
     m = rotation
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     ww = xx + yy + zz

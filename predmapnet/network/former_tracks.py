@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from predmapnet.network.state import Instances, LostTracks, StreamState
+from predmapnet.network.state import Instances, LostTracks
 
 
 @dataclass
@@ -29,24 +29,8 @@ class FormerTracks:
     point_history_valid: Tensor
 
 
-def find_former_tracks(instances: Instances, state: StreamState, warped_history: Tensor | None) -> FormerTracks:
-    """Return the memory of the last frame's tracks.
-
-    Args:
-        instances: of this frame.
-        state: of the last frame.
-        warped_history: ``(B, T, H_m, W_m)``, its history maps in this frame's ego frame, or None.
-    """
-    source, matched = match_tracks(instances, state.instances)
-    return FormerTracks(source, matched, warped_history, state.point_history, state.point_history_valid)
-
-
 def match_tracks(instances: Instances, former: Instances | LostTracks) -> tuple[Tensor, Tensor]:
-    """Find the row of each instance among former tracks, by track id.
-
-    Returns:
-        ``(B, T') int64`` rows (0 where there is none) and ``(B, T') bool``, whether there is one.
-    """
+    """Find former tracks by id: the row ``(B, T') int64`` of each instance (0 for none), and whether it has one."""
     if former.track_ids.shape[1] == 0:
         return torch.zeros_like(instances.track_ids), torch.zeros_like(instances.valid)
     same = instances.track_ids[:, :, None] == former.track_ids[:, None, :]

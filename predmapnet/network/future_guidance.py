@@ -32,16 +32,13 @@ class ShortTermFutureGuidance(nn.Module):
         zero_init(self.fusion)
 
     def forecast(self, history: Tensor, valid: Tensor, labels: Tensor, last_step: Tensor) -> Tensor:
-        """Predict the polylines in the ego frame of t + 1 (eq. 10).
+        """Predict the polylines ``(B, T, P, 2)``, normalised, in the ego frame of t + 1 (eq. 10).
 
         Args:
             history: ``(B, T, n, P, 2)``, normalised, oldest first, padded by the oldest one.
             valid: ``(B, T, n) bool``, False in padding.
             labels: ``(B, T) int64``.
             last_step: ``(B, 2, 3)``, metres: motion of the ground from the ego frame of t - 1 to that of t.
-
-        Returns:
-            ``(B, T, P, 2)``, normalised.
         """
         history = history.detach()  # What was seen must not be bent towards what is still to come.
         last = history[:, :, -1]
@@ -59,13 +56,9 @@ class ShortTermFutureGuidance(nn.Module):
         return clip_polylines(moved, labels == ElementKind.PED_CROSSING, size)[0]
 
     def forward(self, queries: Tensor, forecasts: Tensor) -> Tensor:
-        """Fuse the forecast that was made for this instant into the track queries (eq. 11 and 12).
+        """Fuse the forecasts ``(B, T, P, 2)`` of this instant into the track queries ``(B, T, C)`` (eq. 11 and 12).
 
         The fusion is a linear layer of ``[query, PE_future]``, written as a residual that starts as zero.
-
-        Args:
-            queries: ``(B, T, C)``.
-            forecasts: ``(B, T, P, 2)``, normalised.
         """
         future = self.point_embedding(sine_code(forecasts, SINE_FREQUENCIES)).mean(dim=2)
         return queries + self.fusion(torch.cat([queries, future], dim=-1))
@@ -87,7 +80,7 @@ def extend_history(
         matched: ``(B, T') bool``, whether it continues one.
 
     Returns:
-        ``(B, T', n, P, 2)`` and ``(B, T', n) bool``.
+        Histories ``(B, T', n, P, 2)`` and their validity.
     """
     length = history.shape[2]
     fresh = points[:, :, None].expand(-1, -1, length, -1, -1)

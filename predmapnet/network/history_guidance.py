@@ -19,24 +19,20 @@ class HistoryMapGuidance(nn.Module):
         super().__init__()
         width = config.decoder.width
         self.threshold = config.history_map.threshold
-        bev_width = config.bev.widths[1] if config.masks.stride == 2 else config.bev.widths[0]
-        self.input = nn.Linear(bev_width, width)
+        self.input = nn.Linear(config.bev.widths[config.mask_level], width)
         self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, width)
         self.class_code = nn.Embedding(config.decoder.classes, width)
         self.cross_attention = Attention(width, config.decoder.heads)
         zero_init(self.cross_attention.output)
 
     def forward(self, queries: Tensor, labels: Tensor, history_maps: Tensor, bev: Tensor) -> Tensor:
-        """Refine track queries (eq. 9).
+        """Refine track queries ``(B, T, C)`` (eq. 9).
 
         Args:
-            queries: ``(B, T, C)``.
+            queries: of the tracks.
             labels: ``(B, T) int64``.
             history_maps: ``(B, T, H_m, W_m)``, in the current ego frame.
             bev: ``(B, C_l, H_m, W_m)``, the BEV level of the masks' grid.
-
-        Returns:
-            ``(B, T, C)``.
         """
         if queries.shape[1] == 0:
             return queries

@@ -18,18 +18,13 @@ class HistoryRasterMapMemory:
         self.roi = roi
 
     def align(self, history_maps: Tensor, current_to_past: Tensor) -> Tensor:
-        """Warp the maps to the current ego frame, zeros where the old ROI did not reach (eq. 6).
-
-        Args:
-            history_maps: ``(B, T, H_m, W_m)``, M^(t-1).
-            current_to_past: ``(B, 2, 3)``, metres.
-        """
+        """Warp maps ``(B, T, H_m, W_m)`` by a motion ``(B, 2, 3)``, metres (eq. 6); zeros where the old ROI ended."""
         if history_maps.shape[1] == 0:
             return history_maps
         return warp_bev(history_maps, current_to_past, self.roi)
 
     def update(self, masks: Tensor, scores: Tensor, warped: Tensor, source: Tensor, matched: Tensor) -> Tensor:
-        """Blend the masks of this frame into the maps (eq. 4) or begin new ones (eq. 5).
+        """Blend the masks of this frame into the maps (eq. 4) or begin new ones (eq. 5): ``(B, T', H_m, W_m)``, M^t.
 
         Tracks that have ended are not asked for and are so pruned.
 
@@ -39,9 +34,6 @@ class HistoryRasterMapMemory:
             warped: ``(B, T, H_m, W_m)``, maps of the former tracks in the current frame.
             source: ``(B, T') int64``, which former track an instance continues.
             matched: ``(B, T') bool``, whether it continues one.
-
-        Returns:
-            ``(B, T', H_m, W_m)``, M^t.
         """
         weighted = masks * scores[..., None, None]
         if warped.shape[1] == 0:

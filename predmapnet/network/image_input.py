@@ -28,12 +28,7 @@ WindowPixels = NDArray[np.uint8] | NDArray[np.float32]
 
 @dataclass(frozen=True)
 class ImageWindow:
-    """How one camera's image is scaled and where the network's window lies in it.
-
-    Attributes:
-        scaled_width, scaled_height: pixels after scaling.
-        top: first row of the window in the scaled image.
-    """
+    """Size of one camera's image after scaling, pixels, and the first row of the network's window in it."""
 
     scaled_width: int
     scaled_height: int
@@ -96,12 +91,7 @@ def input_size(config: ImageConfig) -> tuple[int, int]:
 
 
 def crop_image(image: Image, camera: Camera, config: ImageConfig) -> WindowPixels:
-    """Scale one stored image and cut out what the network sees.
-
-    Args:
-        image: ``(camera.height, camera.width, 3) uint8``, RGB.
-        camera: the camera that took it.
-        config: the network's image input.
+    """Scale one stored image ``(camera.height, camera.width, 3) uint8``, RGB, and cut out what the network sees.
 
     Returns:
         ``(config.height, config.width, 3)``, RGB; rows that the image does not have are black.
@@ -134,11 +124,7 @@ def _scaled_rows(image: Image, window: ImageWindow, first: int, last: int) -> ND
 
 
 def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
-    """Turn windows into the network's input.
-
-    Args:
-        images: ``(..., h, w, 3)`` RGB, 0 to 255, from :func:`crop_image`.
-        config: the network's image input.
+    """Turn windows of :func:`crop_image`, ``(..., h, w, 3)``, into the network's input.
 
     Returns:
         ``(..., 3, rows, columns) float32`` of :func:`input_size`, channels-last in memory. Red, green, blue for a

@@ -18,17 +18,15 @@ class MaskHead(nn.Module):
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        fine, middle, _ = config.bev.widths
-        width = config.decoder.width
-        self.stride = config.masks.stride
-        self.features = Pointwise(middle if self.stride == 2 else fine, config.masks.channels)
+        width, self.level = config.decoder.width, config.mask_level
+        self.features = Pointwise(config.bev.widths[self.level], config.masks.channels)
         self.norm = nn.LayerNorm(width)
         self.embedding = Perceptron(width, width, config.masks.channels)
         self.bias = nn.Parameter(torch.tensor(-1.0))
 
     def mask_features(self, levels: Sequence[Tensor]) -> Tensor:
         """Return the features ``(B, C_m, H_m, W_m)`` that all queries are multiplied with, of levels fine to coarse."""
-        return self.features(levels[1] if self.stride == 2 else levels[0])
+        return self.features(levels[self.level])
 
     def forward(self, queries: Tensor, mask_features: Tensor) -> Tensor:
         """Return mask logits ``(B, R, H_m, W_m)`` of queries ``(B, R, C)``."""
@@ -37,7 +35,7 @@ class MaskHead(nn.Module):
 
 
 def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float) -> Tensor:
-    """Turn masks into the cells that each query may attend to (eq. 1).
+    """Turn masks into the cells ``(B, R, rows * columns) bool`` that each query may attend to (eq. 1).
 
     A coarse cell is in the mask if any of the cells below it is, since map lines are one cell wide. A query whose mask
     is empty attends everywhere, as in Mask2Former.
@@ -46,9 +44,6 @@ def attention_cells(mask_logits: Tensor, size: tuple[int, int], threshold: float
         mask_logits: ``(B, R, H_m, W_m)``.
         size: rows and columns of the level that is attended to.
         threshold: tau_L, a probability.
-
-    Returns:
-        ``(B, R, rows * columns) bool``.
     """
     if mask_logits.shape[-2:] != size:
         mask_logits = largest_in_cells(mask_logits, size)

@@ -30,17 +30,7 @@ class Attention(nn.Module):
         self.output = Linear(width, width)
 
     def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None = None) -> Tensor:
-        """Attend.
-
-        Args:
-            query: ``(B, R, C)``.
-            key: ``(B, S, C_k)``.
-            value: ``(B, S, C_k)``.
-            allowed: ``(B, R, S) bool`` or None; every row must allow something.
-
-        Returns:
-            ``(B, R, C)``.
-        """
+        """Attend from ``(B, R, C)`` to ``(B, S, C_k)``; ``allowed (B, R, S) bool`` must allow each row something."""
         q, k, v = (
             tokens.unflatten(-1, (self.heads, -1)).transpose(1, 2)
             for tokens in (self.query(query), self.key(key), self.value(value))
@@ -148,26 +138,25 @@ SINE_FREQUENCIES = 6
 
 
 def sine_code(positions: Tensor, frequencies: int) -> Tensor:
-    """Encode coordinates in [0, 1] by sines and cosines of octaves from half a period up.
-
-    Args:
-        positions: ``(..., d)``.
-        frequencies: octaves per coordinate.
+    """Encode coordinates ``(..., d)`` in [0, 1] by sines and cosines of octaves from half a period up.
 
     Returns:
-        ``(..., d * 2 * frequencies)``.
+        ``(..., d * 2 * frequencies)``: all sines, then all cosines.
     """
     octaves = math.pi * 2.0 ** torch.arange(frequencies, device=positions.device, dtype=positions.dtype)
     angles = (positions[..., None] * octaves).flatten(-2)
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
-def cell_centres(rows: int, columns: int, device: torch.device | None = None) -> Tensor:
-    """Normalised centres (x, y) of the cells of a grid over the ROI; row 0 is the largest y.
+def interleaved_sines(values: Tensor, width: int) -> Tensor:
+    """Encode numbers ``(...)`` by ``(..., width)`` sines and cosines in turns, of periods rising to 10,000."""
+    steps = torch.arange(0, width, 2, device=values.device, dtype=torch.float32)
+    angles = values[..., None] * torch.exp(steps * (-math.log(10000.0) / width))
+    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
-    Returns:
-        ``(rows, columns, 2) float32`` in [0, 1].
-    """
+
+def cell_centres(rows: int, columns: int, device: torch.device | None = None) -> Tensor:
+    """Return the centres (x, y) of a grid's cells over the ROI, 0 to 1: ``(rows, columns, 2)``; y falls by rows."""
     x = (torch.arange(columns, device=device) + 0.5) / columns
     y = 1.0 - (torch.arange(rows, device=device) + 0.5) / rows
     return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)

@@ -12,7 +12,7 @@ from predmapnet.network.maptracker.vector_memory import RecalledQueries
 
 @dataclass
 class DecoderInput:
-    """What the decoder starts from; rows are ``T`` tracks, then ``Q`` detections.
+    """Start of the decoder; rows are ``T`` tracks, then ``Q`` detections.
 
     Attributes:
         queries: ``(B, T + Q, C)``.
@@ -36,7 +36,7 @@ class DecoderInput:
 
 
 class MapDecoder(nn.Module):
-    """What every map decoder offers: from rows and the finest BEV level to polylines.
+    """Base of the map decoders: from rows and the finest BEV level to polylines.
 
     Attributes:
         learns_start: gradient flows from the first layer into the reference points that it starts from; otherwise
@@ -46,11 +46,7 @@ class MapDecoder(nn.Module):
     learns_start: bool
 
     def forward(self, start: DecoderInput, bev: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """Decode.
-
-        Args:
-            start: rows to begin with.
-            bev: ``(B, C_0, H, W)``.
+        """Decode rows over the finest BEV level ``(B, C_0, H, W)``.
 
         Returns:
             Embeddings ``(B, T + Q, C)`` of the last layer, and of every layer the logits ``(B, T + Q, classes)`` and

@@ -9,15 +9,12 @@ from predmapnet.network.kernels.tracing import is_traced
 
 
 def resample_polylines(points: Tensor, count: int, start: Tensor | None = None, stop: Tensor | None = None) -> Tensor:
-    """Place points at equal distances along each line.
+    """Place ``count`` points at equal distances along each line: ``(..., count, 2)``.
 
     Args:
         points: ``(..., P, 2)``, metres.
         count: points per line afterwards.
         start, stop: ``(...)``, stations along the line in metres between which it is kept; its ends by default.
-
-    Returns:
-        ``(..., count, 2)``.
     """
     steps = torch.diff(points, dim=-2).norm(dim=-1)
     stations = torch.cat([torch.zeros_like(steps[..., :1]), steps.cumsum(dim=-1)], dim=-1)
@@ -73,14 +70,7 @@ def clip_polylines(points: Tensor, is_ring: Tensor, roi_size: Tensor) -> tuple[T
 
 
 def chamfer_distances(first: Tensor, second: Tensor) -> Tensor:
-    """Chamfer distance of pairs of lines, as in :func:`mapfusion.geometry.chamfer_distance`.
-
-    Args:
-        first, second: ``(M, K, 2)``, metres.
-
-    Returns:
-        ``(M,)``, metres.
-    """
+    """Return chamfer distances ``(M,)`` of pairs of lines ``(M, K, 2)``, as in :mod:`mapfusion.geometry`."""
     # Several times faster than torch.cdist, which knows no short way for two coordinates.
     x = first[:, :, None, 0] - second[:, None, :, 0]
     y = first[:, :, None, 1] - second[:, None, :, 1]

@@ -5,19 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import (
-    BevFormerConfig,
-    EncoderBevMemoryConfig,
-    MapTrackerDecoderConfig,
-    PredMapNetConfig,
-    ResidualBevMemoryConfig,
-    ResNet50Config,
-)
+from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.network.bev_pyramid import BevPyramid
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.depth_head import DepthHead
 from predmapnet.network.ego_motion import relative_motion
-from predmapnet.network.former_tracks import find_former_tracks, match_tracks
+from predmapnet.network.former_tracks import FormerTracks, match_tracks
 from predmapnet.network.future_guidance import ShortTermFutureGuidance, extend_history
 from predmapnet.network.history_guidance import HistoryMapGuidance
 from predmapnet.network.history_memory import HistoryRasterMapMemory
@@ -45,7 +38,6 @@ from predmapnet.network.state import (
     LayerPredictions,
     LostTracks,
     StreamState,
-    VectorMemory,
     ViewGeometry,
 )
 from predmapnet.network.track_propagation import CarriedTracks, PoseTrackPropagation, TrackPropagation
@@ -68,13 +60,15 @@ class PredMapNet(nn.Module):
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
         self.config = config
-        fine, classes = config.bev.widths[0], config.decoder.classes
-        self.image_backbone = (
-            ResNet50Pyramid(config.backbone)
-            if isinstance(config.backbone, ResNet50Config)
-            else ImageBackbone(config.backbone)
-        )
-        self.bev_encoder = BevFormer(config) if isinstance(config.bev, BevFormerConfig) else BevEncoder(config)
+        bev, fine, classes = config.bev, config.bev.widths[0], config.decoder.classes
+        self.image_backbone: nn.Module
+        self.bev_encoder: BevFormer | BevEncoder
+        if isinstance(bev, BevFormerConfig):
+            self.image_backbone, self.bev_encoder = ResNet50Pyramid(bev.width), BevFormer(config)
+            image_width, residual_memory, needs_pyramid = bev.width, False, config.semantic_queries.enabled
+        else:
+            self.image_backbone, self.bev_encoder = ImageBackbone(bev.backbone), BevEncoder(config)
+            image_width, residual_memory, needs_pyramid = bev.backbone.channels, bev.memory.enabled, False
         self.segmentation_head = (
             UpsamplingSegmentationHead(fine, classes)
             if config.segmentation.kind == "upsampling"
@@ -87,27 +81,22 @@ class PredMapNet(nn.Module):
         needs_masks = config.semantic_queries.enabled or config.history_map.memory
         self.mask_head = MaskHead(config) if needs_masks else None
         self.history_memory = HistoryRasterMapMemory(config.history_map, config.roi)
-        self.history_guidance = HistoryMapGuidance(config) if config.history_map.guidance else None
+        self.history_guidance = HistoryMapGuidance(config) if config.history_map.guides else None
         self.future_guidance = ShortTermFutureGuidance(config) if config.future.enabled else None
-        memory = config.temporal_bev
-        residual = isinstance(memory, ResidualBevMemoryConfig) and memory.enabled
-        self.temporal_bev = ResidualBevMemory(config) if residual else None
-        needs_pyramid = isinstance(config.bev, BevFormerConfig) and config.semantic_queries.enabled
-        self.bev_pyramid = BevPyramid(config.bev.widths) if needs_pyramid else None
-        self.depth_head = DepthHead(config.backbone.channels, config.depth) if config.depth.enabled else None
+        self.temporal_bev = ResidualBevMemory(config) if residual_memory else None
+        self.bev_pyramid = BevPyramid(bev.widths) if needs_pyramid else None
+        self.depth_head = DepthHead(image_width, config.depth) if config.depth.enabled else None
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """The device of the parameters."""
         return self.query_generator.content.device
 
     def view_geometry(self, calibration: Calibration, size: tuple[int, int] | None = None) -> ViewGeometry:
         """Find where the cameras of some frames see the ground; the result serves as long as no camera moves.
 
-        Args:
-            calibration: of the frames.
-            size: rows and columns of the network's input, if not those of the configuration.
+        ``size`` is rows and columns of the network's input, if not those of the configuration.
         """
         geometry: ViewGeometry = self.bev_encoder.geometry(calibration, size or input_size(self.config.image))
         return geometry
@@ -185,11 +174,7 @@ class PredMapNet(nn.Module):
     ) -> BevFeatures:
         """From image features to BEV features; with the encoder ``bevformer`` the BEV memory takes part.
 
-        Args:
-            images: of :meth:`encode_images`.
-            inputs: cameras and poses.
-            state: of the last frame.
-            geometry: :meth:`view_geometry` of these cameras, if it is known.
+        Arguments are those of :meth:`forward`.
         """
         if state is None:
             state = self.initial_state(len(inputs.camera_valid))
@@ -241,7 +226,7 @@ class PredMapNet(nn.Module):
     ) -> tuple[list[Tensor], Tensor]:
         """Return the levels with what past maps add to finished BEV features, and the map to be remembered."""
         fine = levels[0]
-        if isinstance(self.config.temporal_bev, EncoderBevMemoryConfig):
+        if isinstance(self.config.bev, BevFormerConfig):
             return levels, fine
         if self.temporal_bev is None:
             return levels, fine.new_zeros(len(fine), 0, *fine.shape[-2:])
@@ -260,7 +245,7 @@ class PredMapNet(nn.Module):
         if self.config.history_map.memory:
             history = self.history_memory.align(history, relative_motion(ego_to_global, state.ego_to_global))
         if self.history_guidance is not None:
-            level = levels[1] if self.config.masks.stride == 2 else levels[0]
+            level = levels[self.config.mask_level]
             tracks.queries = self.history_guidance(tracks.queries, state.instances.labels, history, level)
         return tracks, history
 
@@ -305,7 +290,8 @@ class PredMapNet(nn.Module):
         if state is None:
             state = self.initial_state(len(inputs.ego_to_global))
         warped = outputs.warped_history if self.config.history_map.memory else None
-        memory = find_former_tracks(instances, state, warped)
+        source, matched = match_tracks(instances, state.instances)
+        memory = FormerTracks(source, matched, warped, state.point_history, state.point_history_valid)
         if lost is not None:
             memory = with_returned_tracks(memory, instances, lost, inputs.ego_to_global, self.config.roi)
         history_maps = instances.masks
@@ -320,7 +306,17 @@ class PredMapNet(nn.Module):
         if self.future_guidance is not None:
             last_step = last_motion(state, inputs.ego_to_global)
             forecasts = self.future_guidance.forecast(history, history_valid, instances.labels, last_step)
-        maps, poses, valid = self._remembered_maps(state, outputs.bev, inputs.ego_to_global)
+        encoder, store = self.config.bev, (state, outputs.bev, inputs.ego_to_global)
+        maps, poses, valid = (
+            store_bev_map(*store, encoder.memory)
+            if isinstance(encoder, BevFormerConfig)
+            else store_raw_map(*store, encoder.memory.spacing)
+        )
+        queries = state.vector_memory
+        if queries.valid.shape[2]:  # Tracks that came back begin anew, as their query does.
+            queries = store_queries(
+                queries, instances.queries, source, matched, inputs.ego_to_global, state.frame, instances.valid
+            )
         newest = torch.cat([instances.track_ids, state.next_track_id[:, None] - 1], dim=1).amax(dim=1)
         return StreamState(
             instances=instances,
@@ -334,23 +330,9 @@ class PredMapNet(nn.Module):
             bev_memory=maps,
             bev_memory_pose=poses,
             bev_memory_valid=valid,
-            vector_memory=self._remembered_queries(state, instances, inputs.ego_to_global),
+            vector_memory=queries,
             lost=None if lost is None else still_lost(lost, instances),
         )
-
-    def _remembered_maps(self, state: StreamState, bev: Tensor, ego_to_global: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        memory = self.config.temporal_bev
-        if isinstance(memory, EncoderBevMemoryConfig):
-            return store_bev_map(state, bev, ego_to_global, memory)
-        return store_raw_map(state, bev, ego_to_global, memory.spacing)
-
-    def _remembered_queries(self, state: StreamState, instances: Instances, ego_to_global: Tensor) -> VectorMemory:
-        """Store the queries; tracks that came back begin anew, as their query does."""
-        memory = state.vector_memory
-        if memory.valid.shape[2] == 0:
-            return memory
-        source, matched = match_tracks(instances, state.instances)
-        return store_queries(memory, instances.queries, source, matched, ego_to_global, state.frame, instances.valid)
 
 
 def _spread(features: Tensor, rows: Tensor, count: int) -> Tensor:

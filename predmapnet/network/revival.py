@@ -71,12 +71,7 @@ def with_returned_tracks(
 ) -> FormerTracks:
     """Add what is remembered of the lost tracks that came back, carried to this frame by the motion of the car.
 
-    Args:
-        memory: of the last frame's tracks.
-        instances: with the ids that :func:`revive` gave them.
-        lost: what it returned beside them.
-        ego_to_global: ``(B, 4, 4) float64``, of this frame.
-        roi: region of all frames.
+    ``instances`` have the ids that :func:`revive` gave them, and ``lost`` is what it returned beside them.
     """
     row, found = match_tracks(instances, lost)
     revived = found & ~memory.matched
@@ -148,19 +143,9 @@ def _shares_id(ids: Tensor, others: Tensor, counted: Tensor) -> Tensor:
 
 
 def _distances(pairs: Tensor, lost: LostTracks, points: Tensor, ego_to_global: Tensor, roi: RegionOfInterest) -> Tensor:
-    """Chamfer distances in metres of lost tracks and instances.
+    """Chamfer distances ``(M,)`` in metres of pairs ``(M, 3)``: stream, lost track, instance.
 
     Of each line only what lies in the ROI of both instants counts: the rest could not be seen at the other one.
-
-    Args:
-        pairs: ``(M, 3)``: stream, lost track, instance.
-        lost: lost tracks.
-        points: ``(B, K, P, 2)``, of the instances, normalised.
-        ego_to_global: ``(B, 4, 4) float64``, of this frame.
-        roi: region of all frames.
-
-    Returns:
-        ``(M,)``.
     """
     stream, row, column = pairs.unbind(dim=1)
     size = points.new_tensor([roi.length, roi.width])
@@ -174,15 +159,7 @@ def _distances(pairs: Tensor, lost: LostTracks, points: Tensor, ego_to_global: T
 
 
 def point_line_distances(points: Tensor, lines: Tensor) -> Tensor:
-    """Distance of each point to its line.
-
-    Args:
-        points: ``(M, P, 2)``, metres.
-        lines: ``(M, S, 2)``, metres.
-
-    Returns:
-        ``(M, P)``.
-    """
+    """Return the distance ``(M, P)`` of each of the points ``(M, P, 2)`` to its line ``(M, S, 2)``, metres."""
     steps = torch.diff(lines, dim=1)[:, None]
     offset = points[:, :, None] - lines[:, None, :-1]
     share = ((offset * steps).sum(dim=-1) / steps.square().sum(dim=-1).clamp(min=1e-9)).clamp(0.0, 1.0)
@@ -201,15 +178,9 @@ def _mean_where(values: Tensor, counted: Tensor) -> Tensor:
 
 
 def _closest_pairs(distances: Tensor) -> Tensor:
-    """Pair rows with columns one to one, the closest first; infinite distances are never paired.
+    """Pair rows with columns of ``(B, L, K)`` one to one, the closest first; infinite distances are never paired.
 
     Two that are each other's nearest are paired whoever else is considered first, so all such pairs are taken at once.
-
-    Args:
-        distances: ``(B, L, K)``.
-
-    Returns:
-        ``(B, L, K) bool``.
     """
     _, rows, columns = distances.shape
     row = torch.arange(rows, device=distances.device)[:, None]

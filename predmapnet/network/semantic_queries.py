@@ -49,10 +49,10 @@ class MaskedAttentionLayer(nn.Module):
         self.feed_forward = FeedForward(width, 2 * width)
 
     def forward(self, queries: Tensor, position: Tensor, tokens: Tensor, token_code: Tensor, allowed: Tensor) -> Tensor:
-        """Refine queries.
+        """Refine queries ``(B, Q, C)``.
 
         Args:
-            queries: ``(B, Q, C)``.
+            queries: of the layer before.
             position: ``(Q, C)``, learned, added to queries and keys of attention.
             tokens: ``(B, S, C)``, BEV features of one level.
             token_code: ``(S, C)``, where these cells are.

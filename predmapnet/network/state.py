@@ -95,7 +95,7 @@ class LostTracks:
 
 @dataclass
 class VectorMemory:
-    """What the tracks were in past frames; rows are the tracks of the state, the newest of ``K`` entries is the last.
+    """Queries of the tracks in past frames; rows are the tracks of the state, the newest of ``K`` entries is the last.
 
     A decoder without such a memory leaves it with no entries (``K = 0``).
 
@@ -172,7 +172,7 @@ class StreamState:
 
 @dataclass
 class LayerPredictions:
-    """What one decoder layer says of each row; rows are ``T`` tracks, then ``Q`` detections.
+    """Predictions of one decoder layer; rows are ``T`` tracks, then ``Q`` detections.
 
     Attributes:
         logits: ``(B, T + Q, 3)`` or None in layers that do not classify.
@@ -187,7 +187,7 @@ class LayerPredictions:
 
 @dataclass
 class FrameOutputs:
-    """What the network says of one instant.
+    """Output of the network for one instant.
 
     Attributes:
         layers: all supervised layers, first to last; the last one is the result.
@@ -214,11 +214,9 @@ class FrameOutputs:
 
 @dataclass
 class ImageFeatures:
-    """What the image backbone makes of the images of one instant.
+    """Features ``(B, N, C, h_i, w_i)`` of the images of one instant, fine to coarse.
 
-    Attributes:
-        levels: ``(B, N, C, h_i, w_i)`` each, fine to coarse.
-        depth: ``(B, N, D, h_0, w_0)`` logits of the auxiliary head, in training where it is switched on; else None.
+    In training there may be depth logits ``(B, N, D, h_0, w_0)`` of the auxiliary head.
     """
 
     levels: list[Tensor]
@@ -227,7 +225,7 @@ class ImageFeatures:
 
 @dataclass
 class BevFeatures:
-    """What the images of one instant say of the ground.
+    """BEV features of the images of one instant.
 
     With the BEV encoder ``lookup`` it is all that can be known before any memory, and what a frozen-BEV stage caches.
     With ``bevformer`` past BEV maps are in it.
@@ -244,7 +242,7 @@ class BevFeatures:
 
 @dataclass
 class Selection:
-    """What inference makes of the rows of one frame.
+    """Selection among the rows of one frame, at inference.
 
     Attributes:
         instances: tracks that live on, newborns included.

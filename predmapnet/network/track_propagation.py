@@ -49,12 +49,7 @@ class TrackPropagation(nn.Module):
         self.is_track = nn.Parameter(torch.zeros(width))
 
     def forward(self, state: StreamState, ego_to_global: Tensor) -> CarriedTracks:
-        """Propagate.
-
-        Args:
-            state: of the last frame.
-            ego_to_global: ``(B, 4, 4) float64``, current.
-        """
+        """Carry the tracks of the last frame to the current pose ``(B, 4, 4) float64``."""
         tracks, past_to_current = state.instances, relative_motion(state.ego_to_global, ego_to_global)
         rotation, translation = past_to_current[:, :, :2], past_to_current[:, :, 2]
         code = torch.cat([rotation[:, 0], translation / 10.0], dim=-1)
@@ -81,17 +76,12 @@ class PoseTrackPropagation(nn.Module):
         self.motion = MotionMlp(config.decoder.width, 2 * config.decoder.width)
 
     def forward(self, state: StreamState, ego_to_global: Tensor) -> CarriedTracks:
-        """Propagate.
-
-        Args:
-            state: of the last frame.
-            ego_to_global: ``(B, 4, 4) float64``, current.
-        """
+        """Carry the tracks of the last frame to the current pose ``(B, 4, 4) float64``."""
         decoder, tracks = self.config.decoder, state.instances
         assert isinstance(decoder, MapTrackerDecoderConfig)
         memory = recall_queries(state.vector_memory, self.motion, ego_to_global, state.frame, decoder.memory_distances)
         past = state.ego_to_global
-        if self.config.quirks.tracks_moved_from_chosen_history and not self.training:
+        if decoder.quirks.tracks_moved_from_chosen_history and not self.training:
             # Released weights are run with this pose, wrong or not; in training it is that of the last frame.
             past = nearest_pose(state, ego_to_global, self.config)
         past_to_current = relative_pose(past, ego_to_global)

@@ -27,11 +27,6 @@ def select(outputs: FrameOutputs, state: StreamState | None, config: PredMapNetC
 
     Without merging thresholds alone decide, as in the paper and in MapTracker: newborns are numbered in the order of
     their queries, and a track that ends is still reported, as a detection.
-
-    Args:
-        outputs: of this frame.
-        state: that went into it.
-        config: of the network.
     """
     rules = config.tracking
     rows = _candidates(outputs, state, rules)

@@ -27,12 +27,9 @@ CAMERA_ORDER = (
 
 
 def scene_blueprint(rig: Rig, bev_shape: tuple[int, int], play: bool = False) -> rrb.Blueprint:
-    """Lay out a scene.
+    """Lay out a scene whose BEV panel has so many rows and columns of pixels.
 
-    Args:
-        rig: the cameras.
-        bev_shape: rows and columns of the BEV panel, pixels.
-        play: start to play at once and follow the newest frame (for live viewing).
+    ``play`` starts at once and follows the newest frame (for live viewing).
     """
     cameras = rrb.Grid(*[_camera_view(name) for name in _in_order(rig)], grid_columns=3 if len(rig) == 6 else None)
     bev = rrb.Vertical(
@@ -60,12 +57,7 @@ def scene_blueprint(rig: Rig, bev_shape: tuple[int, int], play: bool = False) ->
 
 
 def map_blueprint(centre: tuple[float, float], extent: float) -> rrb.Blueprint:
-    """Lay out a finished map: one view straight from above.
-
-    Args:
-        centre: x and y in the middle of the map, metres.
-        extent: larger side of the map, metres.
-    """
+    """Lay out a finished map, its larger side ``extent`` metres, seen straight from above its middle."""
     eye = rrb.EyeControls3D(
         position=(centre[0], centre[1] - 0.25 * extent, 1.0 * extent), look_target=(*centre, 0.0), eye_up=(0, 0, 1)
     )

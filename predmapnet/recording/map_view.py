@@ -17,8 +17,7 @@ from predmapnet.recording.blueprint import WORLD_COORDINATES, map_blueprint
 def log_map_file(recording: rr.RecordingStream, path: Path) -> None:
     """Draw a map of any format that ``predmapnet infer`` writes, in metres east and north of its middle.
 
-    Raises:
-        UserError: the file cannot be read, is no map of ours, or holds no elements.
+    Raises UserError for a file that cannot be read, is no map of ours, or holds no elements.
     """
     try:
         global_map = read_map(path)

@@ -12,14 +12,9 @@ Bytes = NDArray[np.uint8]
 
 
 def raster_picture(rasters: NDArray[np.float32], kinds: NDArray[np.int64]) -> Bytes:
-    """Draw probability rasters in the colours of their kinds; where several overlap the strongest shows.
+    """Draw probability rasters ``(n, rows, columns)`` in the colours of their kinds: ``(rows, columns, 3) uint8``.
 
-    Args:
-        rasters: ``(n, rows, columns)`` in ``[0, 1]``.
-        kinds: ``(n,)``.
-
-    Returns:
-        ``(rows, columns, 3) uint8``, near black where there is nothing.
+    Where several overlap the strongest shows; near black where there is nothing.
     """
     background = np.array(BACKGROUND, dtype=np.float64)
     if len(rasters) == 0:

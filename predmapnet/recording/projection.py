@@ -1,12 +1,11 @@
-"""Lines in pictures: densify, project into a camera, cut where they leave it; dashes; BEV pixels."""
+"""Lines in pictures: project into a camera, cut where they leave it; dashes; BEV pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Bool, Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import arc_length
 from predmapnet.scenes import Camera
@@ -15,37 +14,18 @@ NEAR_METRES = 1.0
 """Points nearer to the camera plane than this are cut off: their projection runs away."""
 
 
-def densify(points: Float, spacing: float) -> Float:
-    """Insert points so that no step is longer than ``spacing`` metres; vertices stay.
-
-    Args:
-        points: ``(n, 2)``, metres.
-        spacing: metres.
-    """
-    distance = arc_length(points)
-    count = max(2, int(np.ceil(distance[-1] / spacing)) + 1)
-    stations = np.sort(np.concatenate([distance, np.linspace(0.0, distance[-1], count)]))
-    return np.stack([np.interp(stations, distance, points[:, axis]) for axis in range(2)], axis=1)
-
-
-def true_runs(mask: NDArray[np.bool_]) -> list[slice]:
+def true_runs(mask: Bool) -> list[slice]:
     """Return the stretches of at least two consecutive true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start >= 2]
 
 
 def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Float]:
-    """Project a line on the road into a picture and keep the parts that are seen.
+    """Project a line ``(n, 2)`` on the road, ego frame, every ``spacing`` metres, into a picture.
 
-    Args:
-        points: ``(n, 2)``, metres, ego frame, on the road.
-        camera: of the picture.
-        spacing: distance between projected points, metres.
-
-    Returns:
-        List of ``(k, 2) float64`` pixels.
+    Returns the parts that are seen, ``(k, 2)`` pixels each.
     """
-    dense = densify(points, spacing)
+    dense = shapely.get_coordinates(shapely.segmentize(shapely.LineString(points), spacing))
     lifted = np.column_stack([dense, np.full(len(dense), camera.ground_height)])
     rotation, position = camera.camera_to_ego[:3, :3], camera.camera_to_ego[:3, 3]
     rays = (lifted - position) @ rotation @ camera.intrinsics.T
@@ -58,12 +38,7 @@ def project_line(points: Float, camera: Camera, spacing: float = 0.5) -> list[Fl
 
 
 def dashes(points: Float, dash: float = 0.7, gap: float = 0.5) -> list[Float]:
-    """Cut a line into dashes.
-
-    Args:
-        points: ``(n, 2)``, metres.
-        dash, gap: metres.
-    """
+    """Cut a line ``(n, 2)`` into dashes, lengths in metres."""
     distance = arc_length(points)
     starts = np.arange(0.0, distance[-1], dash + gap)
     stations = np.stack([starts, np.minimum(starts + dash, distance[-1])], axis=1)
@@ -72,15 +47,9 @@ def dashes(points: Float, dash: float = 0.7, gap: float = 0.5) -> list[Float]:
 
 
 def bev_pixels(points: Float, roi: RegionOfInterest, shape: tuple[int, int]) -> Float:
-    """Map ego coordinates to pixels of a BEV raster (row 0 is the largest y, column 0 the smallest x).
+    """Map points ``(n, 2)`` of the ego frame to pixels of a BEV raster (row 0: largest y, column 0: smallest x).
 
-    Args:
-        points: ``(n, 2)``, metres, ego frame.
-        roi: region of the raster.
-        shape: rows and columns.
-
-    Returns:
-        ``(n, 2) float64``: column and row, pixel centres at ``+0.5``.
+    Returns column and row, pixel centres at ``+0.5``.
     """
     rows, columns = shape
     column = (points[:, 0] / roi.length + 0.5) * columns

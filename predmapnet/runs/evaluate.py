@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapfusion.elements import FrameMap, GlobalMap, RegionOfInterest
+from mapfusion.executors import results_in_order
 from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames import EvaluationFrame
@@ -21,8 +20,9 @@ from predmapnet.evaluation.recognition import check_region, frames_look_like, re
 from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.frame_files.parquet import read_frames, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
-from predmapnet.machine import NetworkOptions, begin_worker, stop_workers
+from predmapnet.machine import NetworkOptions, use_threads
 from predmapnet.mapping import NETWORK_ERRORS
+from predmapnet.runs.process_executor import ProcessExecutor
 from predmapnet.scenes import Instant, Progress, Scene, SceneSource
 from predmapnet.sources import open_source
 
@@ -107,13 +107,9 @@ def submitted_region(results: Path, stated: RegionOfInterest | None) -> RegionOf
 def measure_scenes(
     settings: EvaluationSettings, scenes: Sequence[str], jobs: int = 1, preparing: Progress | None = None
 ) -> Iterator[SceneMeasurement]:
-    """Measure scenes one after the other or in several processes; they come in the order of ``scenes``.
+    """Measure scenes one after the other or in several processes; they come in the order of their names.
 
-    Args:
-        settings: of the evaluation.
-        scenes: names.
-        jobs: number of processes.
-        preparing: called while a scene is made ready (with one process only).
+    ``preparing`` is called while a scene is made ready (with one process only).
 
     Raises:
         UserError: data or results are broken; the message says which.
@@ -123,16 +119,19 @@ def measure_scenes(
         for scene in scenes:
             yield _measure(settings, scene, submitted.get(scene), preparing)
         return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=begin_worker, initargs=(settings.threads,))
-    try:
-        futures = [pool.submit(_measure, settings, scene, submitted.get(scene)) for scene in scenes]
-        for future in futures:
-            yield future.result()
-    except BaseException:
-        stop_workers(pool)
-        raise
-    pool.shutdown()
+    tasks = [(scene, submitted.get(scene)) for scene in scenes]
+    yield from results_in_order(ProcessExecutor(jobs), _MeasuringWork(settings), tasks)
+
+
+@dataclass(frozen=True)
+class _MeasuringWork:
+    """Work of an evaluation in a worker."""
+
+    settings: EvaluationSettings
+
+    def __call__(self) -> Callable[[tuple[str, Submitted | None]], SceneMeasurement]:
+        use_threads(self.settings.threads)
+        return lambda task: _measure(self.settings, *task)
 
 
 def _measure(
@@ -144,15 +143,23 @@ def _measure(
 
         run = map_scene(scene, _mapper(settings))
         frames = _with_truth(scene, run.frame_maps, settings.cache)
-        measured = measure_scene(frames, run.global_map, scene.truth_map(), run.seconds, settings.protocol)
-        return replace(measured, weights_sha256=_mapper(settings).weights_sha256)
+        truth_map = scene.truth_map()
+        measured = measure_scene(frames, run.global_map, truth_map, run.seconds, settings.protocol)
+        maps = _pair(run.global_map, truth_map)
+        return replace(measured, weights_sha256=_mapper(settings).weights_sha256, maps=maps)
     if submitted is not None:
         found = _Found(_submitted_maps(submitted, settings.roi, scene), len(scene) - len(submitted), None)
     else:
         found = _stored_maps(settings.results, scene, _source(settings).name)
     frames = _with_truth(scene, found.maps, settings.cache)
-    measured = measure_scene(frames, _integrated(name, found.maps), scene.truth_map(), protocol=settings.protocol)
-    return replace(measured, absent_frames=found.absent, weights_sha256=found.weights_sha256)
+    global_map, truth_map = _integrated(name, found.maps), scene.truth_map()
+    measured = measure_scene(frames, global_map, truth_map, protocol=settings.protocol)
+    maps = _pair(global_map, truth_map)
+    return replace(measured, absent_frames=found.absent, weights_sha256=found.weights_sha256, maps=maps)
+
+
+def _pair(global_map: GlobalMap | None, truth_map: GlobalMap | None) -> tuple[GlobalMap, GlobalMap] | None:
+    return None if global_map is None or truth_map is None else (global_map, truth_map)
 
 
 @dataclass(frozen=True)

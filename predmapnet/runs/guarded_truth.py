@@ -15,11 +15,7 @@ Found = TypeVar("Found")
 
 
 class GuardedTruth:
-    """Scene that has no ground truth where the scene behind it fails to give it.
-
-    Attributes:
-        problem: why ground truth is missing, empty if it is not.
-    """
+    """Scene that has no ground truth where the scene behind it fails to give it; ``problem`` says why."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene

@@ -17,11 +17,12 @@ import predmapnet
 from mapfusion.elements import ElementKind, GlobalMap, RegionOfInterest
 from mapfusion.formats.by_suffix import write_map
 from mapfusion.formats.local_plane import LocalPlane
+from mapfusion.formats.reference_systems import FromDegrees
 from mapfusion.georeference import LOCAL_FRAME, Georeference
 from mapfusion.ground import observed_rings
 from predmapnet.datasets.georeference import LocalFrame, local_frame
 from predmapnet.demo_world.source import DEMO
-from predmapnet.errors import value_errors_told
+from predmapnet.errors import UserError, value_errors_told
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
@@ -60,11 +61,9 @@ UNTRAINED_NOTE = (
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Accuracy of a run against the ground truth.
+    """Accuracy of a run against the ground truth: chamfer mAP of the frames, and figures of the global map.
 
-    Attributes:
-        mean_ap: chamfer mAP of the frames at the thresholds of the benchmark.
-        precision, recall: of the global map, length-weighted, at 1.0 m, inside the area that was seen.
+    Precision and recall are length-weighted, at 1.0 m, inside the area that was seen.
     """
 
     mean_ap: float
@@ -106,12 +105,7 @@ class SceneReport:
 
 @dataclass(frozen=True)
 class MappedScene:
-    """Result of a pipeline: the map, its frames and the report.
-
-    Attributes:
-        run: the global map, and the map of each frame without rasters.
-        report: the figures.
-    """
+    """Result of a pipeline: the run (map and frame maps without rasters) and the report of it."""
 
     run: SceneRun
     report: SceneReport
@@ -190,6 +184,8 @@ class MappingPipeline:
         provenance = self.provenance(scene)
         torch.manual_seed(SEED)
         georeference, notes = self._place(scene)
+        if outputs.crs is not None:
+            _check_place(outputs.crs, georeference, scene)
         if isinstance(georeference, LocalFrame):
             provenance[LOCAL_FRAME] = georeference.frame
         with ExitStack() as files:
@@ -210,7 +206,8 @@ class MappingPipeline:
             if outputs.map is not None:
                 observed = observed_rings(run.observed, georeference)
                 with value_errors_told():
-                    write_map(run.global_map, outputs.map, georeference, {**provenance, "observed": observed})
+                    told = {**provenance, "observed": observed}
+                    write_map(run.global_map, outputs.map, georeference, told, outputs.crs)
             if outputs.frames is not None:
                 pairs = zip(run.frames, run.frame_maps, strict=True)
                 stored = (StoredFrame(frame.scene, frame.index, frame.token, mapped) for frame, mapped in pairs)
@@ -293,6 +290,14 @@ class _ProgressObserver:
 
     def end(self, global_map: GlobalMap) -> None:
         pass
+
+
+def _check_place(crs: str, georeference: Georeference, scene: Scene) -> None:
+    """Check before the work begins that a scene lies where a reference system holds. Raises UserError."""
+    if isinstance(georeference, LocalFrame):
+        raise UserError(f"--crs {crs}: the place of {scene.info.name} on Earth is not known; say it with --origin")
+    with value_errors_told():
+        FromDegrees(crs).positions(georeference.to_wgs84(scene.instant(0).ego_to_global[None, :2, 3]))
 
 
 def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest
+from mapfusion import FrameMap, GlobalMap, MapIntegrator, RegionOfInterest, correct_poses
 from mapfusion.ground import seen_along
 from mapfusion.provenance import united_provenance
 from mapfusion.road_heights import RoadHeights
@@ -64,6 +64,7 @@ def integrate_file(
     min_score: float = 0.4,
     y_forward: bool = False,
     normalised: bool = False,
+    correct: bool = False,
 ) -> Integration:
     """Read per-frame results and fuse them.
 
@@ -74,6 +75,7 @@ def integrate_file(
         min_score: elements below are left out where the file has no track ids, since nothing has picked them.
         y_forward: the file's x points right and its y forward, as MapTR's on nuScenes.
         normalised: points are shares of the region's sides, from 0 to 1, instead of metres.
+        correct: take out what the poses of single frames are off, see :func:`mapfusion.correct_poses`.
 
     Raises:
         UserError: a file that cannot be read, tokens without poses, points that cannot be metres of the ego frame.
@@ -93,6 +95,8 @@ def integrate_file(
         submitted = read_detections(frames, notes, region if normalised else None, y_forward)
         known = read_poses(poses, notes)
         logged = _placed(frames, poses, submitted, known, region, min_score, notes)
+    if correct:
+        logged = _corrected(logged, notes)
     found = integrate_frames(logged)
     if len(found.map) == 0:
         notes.append(empty_sentence(found.frames))
@@ -100,12 +104,21 @@ def integrate_file(
     return replace(found, notes=tuple(notes), provenance=provenance)
 
 
-def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
-    """Fuse frames, in the order of their times.
+def _corrected(frames: Sequence[LoggedFrame], notes: list[str]) -> list[LoggedFrame]:
+    """Correct the poses of each drive, and note by how much."""
+    corrected: list[LoggedFrame] = []
+    for log in dict.fromkeys(frame.log for frame in frames):
+        before = [frame.frame_map for frame in frames if frame.log == log]
+        after = correct_poses(before)
+        moves = [(b.ego_to_global - a.ego_to_global)[:2, 3] for a, b in zip(before, after, strict=True)]
+        size = np.sqrt(np.nanmean(np.square(moves).sum(axis=1)))
+        notes.append(f"poses of {log or 'the drive'} corrected by {size:.2f} m on average")
+        corrected += [LoggedFrame(log, frame) for frame in after]
+    return corrected
 
-    Raises:
-        UserError: there is no frame, or none that can be used.
-    """
+
+def integrate_frames(frames: Iterable[LoggedFrame]) -> Integration:
+    """Fuse frames in the order of their times; raises UserError where none can be used."""
     ordered = sorted(frames, key=lambda frame: (frame.log, frame.frame_map.timestamp))
     if not ordered:
         raise UserError("there is no frame to integrate")

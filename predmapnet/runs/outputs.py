@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mapfusion.formats.by_suffix import check_suffix
+from mapfusion.formats.by_suffix import check_crs, check_suffix
 from predmapnet.errors import UserError, value_errors_told
 from predmapnet.files import check_output
 
@@ -16,9 +16,10 @@ class Outputs:
     """Paths of the outputs; None for those that are not written.
 
     Attributes:
-        map: GeoJSON, GeoPackage, FlatGeobuf or Lanelet2, by its ending.
+        map: of the format that its ending stands for (:data:`mapfusion.formats.by_suffix.SUFFIXES`).
         recording: Rerun recording.
         frames: per-frame results (Parquet).
+        crs: reference system of the map, an EPSG code; None for the one of its format.
         force: replace a map that was changed since we wrote it.
     """
 
@@ -26,6 +27,7 @@ class Outputs:
     recording: Path | None = None
     frames: Path | None = None
     force: bool = False
+    crs: str | None = None
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -42,3 +44,4 @@ class Outputs:
         if self.map is not None:
             with value_errors_told():
                 check_suffix(self.map)
+                check_crs(self.map, self.crs)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mapfusion.elements import ElementKind
-from predmapnet.config import EncoderBevMemoryConfig
+from predmapnet.config import BevFormerConfig
 from predmapnet.network.ego_motion import relative_motion, relative_pose
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.maptracker.bev_memory import store_bev_map
@@ -115,7 +115,7 @@ class StageTraining(nn.Module):
             sums.add_all(segmentation_losses(outputs.segmentation, truth.targets, weights))
             if weights.transformation and seen is not None and past.chosen is not None and past.truth is not None:
                 self._add_transformation(sums, past.state, seen, past.chosen, past.truth, inputs)
-            exclusive = network.config.tracking.query_assignment == "suppress"
+            exclusive = network.config.decoder.query_assignment == "suppress"
             matched = match(outputs, truth, past.owners, weights, exclusive, self._unit)
             add_layers(sums, outputs, truth, matched, past.owners.kinds.shape[1], weights, self._unit)
             if past.state is None:
@@ -197,9 +197,9 @@ class StageTraining(nn.Module):
 
     def _with_map(self, state: StreamState | None, bev: Tensor, inputs: FrameInputs) -> StreamState:
         """Remember the BEV features of an instant, and nothing else."""
-        memory = self.network.config.temporal_bev
-        assert isinstance(memory, EncoderBevMemoryConfig) and state is not None
-        maps, poses, valid = store_bev_map(state, bev, inputs.ego_to_global, memory)
+        encoder = self.network.config.bev
+        assert isinstance(encoder, BevFormerConfig) and state is not None
+        maps, poses, valid = store_bev_map(state, bev, inputs.ego_to_global, encoder.memory)
         state = replace(state, bev_memory=maps, bev_memory_pose=poses, bev_memory_valid=valid)
         return replace(state, ego_to_global=inputs.ego_to_global, frame=state.frame + 1)
 

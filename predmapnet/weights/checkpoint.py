@@ -71,10 +71,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(path: Path | None = None) -> Checkpoint:
-    """Read a network.
-
-    Args:
-        path: a file that :func:`save_checkpoint` wrote; None for the shipped weights.
+    """Read a network that :func:`save_checkpoint` wrote; None for the shipped weights.
 
     Raises:
         UserError: the file is missing, damaged, from something else, or its weights do not fit its configuration.

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from predmapnet.config import PredMapNetConfig, ResNet50Config
+from predmapnet.config import BevFormerConfig, PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import PRESETS
@@ -83,8 +83,8 @@ def import_imagenet_backbone(
     Raises:
         UserError: the configuration has another backbone; entries are unknown, missing or of another shape.
     """
-    if not isinstance(config.backbone, ResNet50Config):
-        known = ", ".join(name for name, found in PRESETS.items() if isinstance(found.backbone, ResNet50Config))
+    if not isinstance(config.bev, BevFormerConfig):
+        known = ", ".join(name for name, found in PRESETS.items() if isinstance(found.bev, BevFormerConfig))
         raise UserError(f"{config.name} has no ResNet-50 to begin from ImageNet. Choose one of: {known}.")
     mapped, ignored, unknown = {}, [], []
     for name in official:

@@ -85,10 +85,7 @@ def parts_of(names: Iterable[str]) -> list[str]:
 
 
 def inspect_file(path: Path | None = None) -> WeightsInfo:
-    """Look into a safetensors file.
-
-    Args:
-        path: of the file; None for the weights that come with the package.
+    """Look into a safetensors file; None for the weights that come with the package.
 
     Raises:
         UserError: there is no such file, or it is no whole safetensors file.

@@ -1,4 +1,4 @@
-"""How much of a network's accuracy remains on bad days: ``python -m tests.benchmarks.bad_days [--json FILE]``.
+"""Accuracy on bad days, as a share of that on good ones: ``python -m tests.benchmarks.bad_days [--json FILE]``.
 
 Maps the test towns of the demo world once as they are, and then with one fault at a time, in up to three severities:
 images (exposure, low light, fog, rain, motion blur, noise, colour, dirt), cameras and images and frames that are lost,

@@ -1,4 +1,4 @@
-"""What a frame costs: CPU seconds and multiply-adds per part of the network, with the paper's modules on in turn.
+"""Cost of a frame: CPU seconds and multiply-adds per part of the network, with the paper's modules on in turn.
 
     python -m tests.benchmarks.network_cost paper-nuscenes --threads 2
 

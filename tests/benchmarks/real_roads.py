@@ -1,4 +1,4 @@
-"""How well a network maps real roads: ``python -m tests.benchmarks.real_roads [--json FILE]``.
+"""Accuracy of a network on real roads: ``python -m tests.benchmarks.real_roads [--json FILE]``.
 
 Reads what it finds below ``$PREDMAPNET_REFERENCE`` and prints one line per drive:
 

@@ -18,16 +18,15 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.demo_world.catalogue import FIRST_SPLITS, vector_map
 from predmapnet.demo_world.first_towns import first_town
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, VectorMap
 from tests.real_roads.argoverse_logs import vector_map_of
 
-Float = NDArray[np.float64]
 Row = dict[str, str]
 
 

@@ -1,4 +1,4 @@
-"""What a frame costs, and that it does not cost more on a larger map."""
+"""Cost of a frame in the integrator, which does not grow with the map."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from mapfusion.formats.by_suffix import read_map, write_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import arc_length
 from mapfusion.merge.merge import merge_files
+from predmapnet.runs.process_executor import ProcessExecutor
 
 pytestmark = pytest.mark.benchmark_only
 
@@ -93,7 +94,7 @@ def test_merging_a_city(tmp_path, capsys):
             paths.append(tmp_path / f"drive-{number:04d}.geojson")
             write_map(global_map, paths[-1], PLANE)
     start = time.perf_counter()
-    report = merge_files(paths, tmp_path / "city.geojson", jobs=2)
+    report = merge_files(paths, tmp_path / "city.geojson", executor=ProcessExecutor(2))
     seconds = time.perf_counter() - start
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
     merged = read_map(tmp_path / "city.geojson", PLANE)

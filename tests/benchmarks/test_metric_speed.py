@@ -1,4 +1,4 @@
-"""How fast the metrics are, as ratios to the official code on the same 93 frames, and at the size of nuScenes val.
+"""Speed of the metrics, as ratios to the official code on the same 93 frames, and at the size of nuScenes val.
 
 The official seconds are CPU seconds of a single process (``timing_official.json`` beside the fixtures). On a machine
 that does nothing else:

@@ -1,4 +1,4 @@
-"""What a frame costs, part by part and over a long drive; the figures depend on the machine and are printed."""
+"""Cost of a frame, part by part and over a long drive; the figures depend on the machine and are printed."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What holds for all commands: quick help, the version, where errors go, and what view and scenes say."""
+"""All commands: quick help, the version and error messages; and the output of view and scenes."""
 
 import json
 import subprocess

@@ -20,7 +20,7 @@ from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import save_checkpoint
 from predmapnet.weights.files import weights_hash
 from tests.cli.tiny_nuscenes import edit_table, image_path, write_tiny_nuscenes
-from tests.predmapnet.network.small_baseline import small_config
+from tests.predmapnet.small_networks import small_config
 
 
 @pytest.fixture

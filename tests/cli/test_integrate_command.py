@@ -1,6 +1,7 @@
 """Other detectors' results become a map, and what does not fit is named."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from mapfusion.formats.by_suffix import read_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.ground import coverage
 from predmapnet.frame_files.parquet import StoredFrame, write_frames
+from tests.mapfusion.map_quality import measure
+from tests.mapfusion.pose_noise import off_by_frame
 from tests.mapfusion.simulation import town_drive
 
 ORIGIN = "49.0,8.4"
@@ -204,3 +207,21 @@ def test_ground_that_could_not_be_seen_is_told_by_a_submission(predmapnet, tmp_p
         assert len(read_map(tmp_path / "map.geojson", PLANE)) == expected
     write(tmp_path / "results.json", {"meta": {}, "results": {"t0": line | {"visible": 3}}})
     assert "visible" in predmapnet("integrate", *arguments).err
+
+
+def test_poses_of_single_frames_are_corrected_if_wanted(predmapnet, tmp_path, drive):
+    poses_off = off_by_frame([frame.ego_to_global for frame in drive.frames], np.random.default_rng(0))
+    stored = [
+        StoredFrame("log-1", i, "", replace(frame, ego_to_global=at))
+        for i, (frame, at) in enumerate(zip(drive.frames, poses_off, strict=True))
+    ]
+    write_frames(tmp_path / "frames.parquet", stored, {"location": "somewhere"})
+    quality = {}
+    for option in ((), ("--correct-poses",)):
+        arguments = ("integrate", "frames.parquet", "--origin", ORIGIN, "--out", "map.geojson", *option)
+        result = predmapnet(*arguments)
+        assert result.code == 0, result.err
+        assert ("poses of log-1 corrected by" in result.err) is bool(option)
+        quality[bool(option)] = measure(read_map(tmp_path / "map.geojson", PLANE), drive, within=0.3)
+    assert quality[True].precision > quality[False].precision + 0.03, quality
+    assert quality[True].recall > quality[False].recall

@@ -38,6 +38,9 @@ def test_a_folder_of_maps_becomes_one(predmapnet, tmp_path):
     assert len(features) == 3
     sources = {f["properties"]["kind"]: f["properties"]["sources"] for f in features}
     assert sources["divider"] == ["log-0/map", "log-2/map"]
+    told = json.loads(predmapnet("merge", tmp_path / "runs", "--out", "city.geojson", "--force", "--json").out)
+    shifts = np.array([entry["correction"]["shift"] for entry in told["maps"]])
+    np.testing.assert_allclose(shifts[1] - shifts[0], [-0.8, 0.5], atol=0.1)
 
 
 def test_what_could_not_be_aligned_is_said(predmapnet, tmp_path):

@@ -1,4 +1,4 @@
-"""What a map claims to have observed where a camera has no image: by command, by function and in a script."""
+"""Observed ground of a map where a camera has no image: by command, by function and in a script."""
 
 import numpy as np
 import pytest

@@ -114,7 +114,7 @@ def test_a_geopackage_that_was_only_looked_at_counts_as_untouched(tmp_path):
         database.execute("PRAGMA journal_mode = DELETE")
     assert not edited_since_written(path)
     with sqlite3.connect(path) as database:
-        database.execute("CREATE TABLE layer_styles (id INTEGER, styleQML TEXT)")
+        database.execute("UPDATE layer_styles SET styleQML = '<qgis/>'")
     assert edited_since_written(path), "a style is work, too"
 
 

@@ -12,7 +12,7 @@ import shapely
 import shapely.ops
 
 from mapfusion.elements import GlobalMap
-from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Detector, Drive, element, simulate
+from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Detector, Drive, Float, element, pose, simulate
 
 PROJECT = Path(__file__).parents[2]
 LOGS = (
@@ -23,19 +23,24 @@ LOGS = (
 
 def log_drive(log: Path, seed: int, frames: int = 40, detector: Detector | None = None) -> Drive:
     """Return a simulated drive of 40 frames at 2 Hz (or as many as the log has) over the log's real lines."""
+    return simulate(log_map(log), log_poses(log, frames), np.random.default_rng(seed), detector)
+
+
+def log_poses(log: Path, frames: int = 40) -> list[Float]:
+    """Return the poses of a log at 2 Hz, flat on the ground."""
     table = feather.read_table(log / "city_SE3_egovehicle.feather").sort_by("timestamp_ns")
     stamps = table["timestamp_ns"].to_numpy()
     values = np.stack([table[name].to_numpy() for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m")], axis=1)
     wanted = np.arange(stamps[0], stamps[-1], 500_000_000)[:frames]
-    poses = []
-    for qw, qx, qy, qz, x, y in values[np.searchsorted(stamps, wanted)]:
-        heading = np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
-        pose = np.eye(4)
-        pose[:2, :2] = [[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]]
-        pose[:2, 3] = [x, y]
-        poses.append(pose)
-    truth = true_map(next((log / "map").glob("log_map_archive_*.json")))
-    return simulate(truth, poses, np.random.default_rng(seed), detector)
+    return [
+        pose(x, y, float(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))))
+        for qw, qx, qy, qz, x, y in values[np.searchsorted(stamps, wanted)]
+    ]
+
+
+def log_map(log: Path) -> GlobalMap:
+    """Return the true map of a log, see :func:`true_map`."""
+    return true_map(next((log / "map").glob("log_map_archive_*.json")))
 
 
 def true_map(path: Path) -> GlobalMap:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement
 from mapfusion.geometry import arc_length, resample, transform_points
-
-Float = NDArray[np.float64]
 
 
 class PairwiseAveraging:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from mapfusion import ElementKind, GlobalMap, MapIntegrator
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from tests.mapfusion.argoverse import LOGS, log_drive
 from tests.mapfusion.map_quality import dense, looked_at
@@ -27,7 +27,6 @@ from tests.mapfusion.simulation import Detector, Drive, town_drive
 if TYPE_CHECKING:
     from tests.mapfusion.demo_towns import MappedTown
 
-Float = NDArray[np.float64]
 
 BAND = 1.96
 """Deviations to either side that hold 95 % of a normal distribution."""

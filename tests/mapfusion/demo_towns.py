@@ -1,4 +1,4 @@
-"""What the shipped network sees in the towns of the demo world, frame by frame, and what is true there."""
+"""Frame maps of the shipped network in the towns of the demo world, and the truth there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How good a fused map is, against the true one: the figures of the comparison table."""
+"""Quality of a fused map against the true one: the figures of the comparison table."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
 from tests.mapfusion.simulation import ROI, Drive, Ghost
@@ -16,7 +17,6 @@ from tests.mapfusion.simulation import ROI, Drive, Ghost
 if TYPE_CHECKING:
     from tests.mapfusion.demo_towns import MappedTown
 
-Float = NDArray[np.float64]
 STEP = 0.25
 FAR = 1e6
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import shapely
 import shapely.ops
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import arc_length, inverse_pose, resample, transform_points
 from mapfusion.ground import CameraSector, ground_within, visible_ground
 
-Float = NDArray[np.float64]
 DIVIDER, BOUNDARY, CROSSING = ElementKind.DIVIDER, ElementKind.BOUNDARY, ElementKind.PED_CROSSING
 ROI = RegionOfInterest()
 

@@ -1,4 +1,4 @@
-"""What a map lost, gained and moved, whatever the elements that its lines are cut into."""
+"""Diffs: lines removed, added and moved, whatever the elements that they are cut into."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_cutting_lines_otherwise_changes_nothing(shares, seed):
     old = town(seed)
     new = GlobalMap(tuple(piece for element in old for piece in cut(element, shares)))
     found = diff_maps(old, new)
-    length = sum(element.length for element in old)
+    length = sum(element.extent[0] for element in old)
     assert total(found, Change.UNCHANGED) == pytest.approx(length, rel=1e-3)
     assert all(total(found, change) == 0.0 for change in Change if change is not Change.UNCHANGED)
 
@@ -145,9 +145,9 @@ def test_an_offset_between_drives_is_not_a_change():
     found = diff_maps(old, shifted)
     assert found.alignment.certain
     assert np.abs(found.alignment.shift - [-1.1, 0.8]).max() < 0.03
-    assert total(found, Change.UNCHANGED) == pytest.approx(sum(e.length for e in old), rel=0.01)
+    assert total(found, Change.UNCHANGED) == pytest.approx(sum(e.extent[0] for e in old), rel=0.01)
     as_it_lies = diff_maps(old, shifted, config=DiffConfig(align=False))
-    assert total(as_it_lies, Change.MOVED) > 0.5 * sum(e.length for e in old)
+    assert total(as_it_lies, Change.MOVED) > 0.5 * sum(e.extent[0] for e in old)
 
 
 @given(st.lists(st.integers(-1, 3), min_size=1, max_size=60), st.integers(1, 8))
@@ -172,7 +172,7 @@ def test_empty_maps_compare():
     empty = GlobalMap(())
     assert not diff_maps(empty, empty).differences
     found = diff_maps(empty, town())
-    assert total(found, Change.ADDED) == pytest.approx(sum(e.length for e in town()), rel=1e-3)
+    assert total(found, Change.ADDED) == pytest.approx(sum(e.extent[0] for e in town()), rel=1e-3)
     assert total(diff_maps(town(), empty), Change.UNOBSERVED) > 0
 
 

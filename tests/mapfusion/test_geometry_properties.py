@@ -1,4 +1,4 @@
-"""What holds for any polyline: resampling, poses, clipping, chamfer distance; and outlines of grids."""
+"""Properties of the geometry for any polyline: resampling, poses, clipping, chamfer distance; and outlines of grids."""
 
 from __future__ import annotations
 

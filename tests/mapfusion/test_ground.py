@@ -1,4 +1,4 @@
-"""What could not be seen is no evidence; what could be seen and was not there is."""
+"""Visible ground: a missing detection counts against an element only where it could have been seen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mapfusion import ElementKind, FrameMap, GlobalMap, MapIntegrator
 from mapfusion.geometry import transform_points
-from mapfusion.ground import CameraSector, frame_ground, ground_within, seen_along, visible_ground
+from mapfusion.ground import CameraSector, ground_within, seen_along, visible_ground
 from tests.mapfusion.integrate.test_integrator_properties import frame_map, integrate
 from tests.mapfusion.map_quality import dense, nearest
 from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, ROI, Detector, element, pose, simulate
@@ -126,7 +126,7 @@ def test_ground_of_a_frame_lies_where_the_car_was():
         frame_map([], ego_to_global=pose(100.0, 50.0, np.pi / 2)),
         visible=(np.array([[0, -5], [10, -5], [10, 5], [0, 5]]),),
     )
-    ground = frame_ground(frame)
+    ground = seen_along([frame])
     expected = transform_points(frame.ego_to_global, np.array([[5.0, 0.0]]))[0]
     assert ground.area == pytest.approx(100.0)
     assert shapely.distance(ground.centroid, shapely.Point(expected)) < 1e-9
@@ -138,7 +138,7 @@ def test_ground_seen_along_a_drive_is_the_union_of_its_frames_and_nothing_that_a
     frames = [frame_map([], ego_to_global=place) for place in poses]
     frames = [replace(frame, visible=front if number > 1 else None) for number, frame in enumerate(frames)]
     seen = seen_along(frames)
-    assert seen.equals(shapely.union_all([frame_ground(frame) for frame in frames]))
+    assert seen.equals(shapely.union_all([seen_along([frame]) for frame in frames]))
     behind_the_last = transform_points(poses[-1], np.array([[-25.0, 12.0]]))[0]
     assert not shapely.contains_xy(seen, *behind_the_last)
     assert shapely.contains_xy(seen, *transform_points(poses[0], np.array([[-25.0, 12.0]]))[0])

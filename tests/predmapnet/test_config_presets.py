@@ -7,7 +7,9 @@ from pydantic import ValidationError
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import load_config, parse_config, preset
+from tests.predmapnet.small_networks import small_config
 
 
 def test_json_brings_a_configuration_back():
@@ -37,43 +39,57 @@ def test_the_paper_s_network_and_its_baseline(name, cameras, height, width):
     assert parse_config(paper.to_json(), "here") == paper
 
 
-def test_files_without_kinds_are_those_of_lite():
-    old = '{"backbone": {"channels": 24}, "bev": {"rows": 40}, "decoder": {"queries": 30}, "temporal_bev": {}}'
-    config = parse_config(old, "here")
-    kinds = [config.image.kind, config.backbone.kind, config.bev.kind, config.temporal_bev.kind, config.decoder.kind]
-    assert kinds == ["window", "small", "lookup", "residual", "points"]
-    assert (config.backbone.channels, config.bev.rows, config.decoder.queries) == (24, 40, 30)
+def test_weights_of_the_former_layout_are_read():
+    """Parts stood beside what they belong to, and sections without a kind are those of lite."""
+    old = {
+        "backbone": {"kind": "small", "channels": 24},
+        "bev": {"rows": 40},
+        "temporal_bev": {"capacity": 3},
+        "masks": {"stride": 1, "channels": 16},
+        "tracking": {"query_assignment": "suppress", "tau_d": 0.4},
+        "quirks": {"mirrored_self_attention": False, "norm_before_cross_attention": False},
+    }
+    config = parse_config(json.dumps(old), "here")
+    assert [config.image.kind, config.bev.kind, config.decoder.kind] == ["window", "lookup", "points"]
+    assert (config.bev.backbone.channels, config.bev.rows, config.bev.memory.capacity) == (24, 40, 3)
+    assert (config.bev.mask_stride, config.masks.channels) == (1, 16)
+    assert (config.decoder.query_assignment, config.tracking.tau_d) == ("suppress", 0.4)
+    assert parse_config(config.to_json(), "here") == config
 
 
-@pytest.mark.parametrize(
-    ("sections", "words"),
-    [
-        ({"backbone": {"kind": "small"}}, "'bevformer' reads the three levels"),
-        ({"temporal_bev": {"kind": "residual"}}, "needs temporal_bev 'encoder'"),
-        ({"backbone": {"kind": "resnet50", "channels": 128}}, "backbone.channels"),
-        ({"masks": {"stride": 2}}, "masks.stride"),
-        ({"tracking": {"query_assignment": "one_way"}}, "'maptracker' lets detections see tracks"),
-        ({"decoder": {"kind": "points"}}, "decoder 'maptracker': norm_before_cross_attention"),
-    ],
-)
-def test_parts_that_do_not_fit_together_are_refused(sections, words):
-    values = preset("maptracker-nuscenes").model_dump()
-    with pytest.raises(ValidationError, match=words):
-        PredMapNetConfig.model_validate({**values, **sections})
+def test_weights_of_maptracker_in_the_former_layout_are_read():
+    present = json.loads(preset("maptracker-nuscenes").to_json())
+    old = present | {
+        "backbone": {"kind": "resnet50", "channels": 256},
+        "temporal_bev": {"kind": "encoder", **present["bev"].pop("memory")},
+        "quirks": present["bev"].pop("quirks") | present["decoder"].pop("quirks"),
+    }
+    old["masks"]["stride"] = present["bev"].pop("mask_stride")
+    old["tracking"]["query_assignment"] = present["decoder"].pop("query_assignment")
+    assert parse_config(json.dumps(old), "here") == preset("maptracker-nuscenes")
+
+
+def test_without_the_history_maps_nothing_is_guided_by_them():
+    network = PredMapNet(small_config("lite", history_map={"memory": False}))
+    assert network.history_guidance is None
 
 
 @pytest.mark.parametrize(
     ("section", "values", "words"),
     [
-        ("decoder", {"heads": 5}, "decoder.width has to be a multiple of decoder.heads"),
-        ("decoder", {"width": 30, "heads": 3}, "decoder.width has to be a multiple of 4"),
+        ("decoder", {"heads": 5}, "decoder: width 512 has to be a multiple of heads"),
+        ("decoder", {"width": 30, "heads": 3}, "decoder.width: Input should be a multiple of 4"),
         ("decoder", {"classes": 4}, "Input should be 3"),
+        ("decoder", {"query_assignment": "one_way"}, "decoder.query_assignment: Input should be 'suppress'"),
+        ("bev", {"mask_stride": 2}, "bev.mask_stride: Input should be 1"),
+        ("bev", {"width": 33, "heads": 3}, "bev.width: Input should be a multiple of 2"),
+        ("bev", {"backbone": {}}, "bev.backbone: Extra inputs are not permitted"),
         ("decoder", {"memory_distances": [5.0, 1.0]}, "memory_distances: should increase"),
-        ("bev", {"heads": 5}, "bev.width has to be even and a multiple of bev.heads"),
-        ("bev", {"pillar_points": 3}, "bev.pillar_points has to divide 8"),
-        ("bev", {"pillar_low": 5.0}, "bev.pillar_low has to be below bev.pillar_high"),
-        ("temporal_bev", {"distances": []}, "temporal_bev.distances: Tuple should have at least 1"),
-        ("depth", {"near": 40.0}, "depth.near has to be less than depth.far"),
+        ("bev", {"heads": 5}, "bev: width 256 has to be a multiple of heads"),
+        ("bev", {"pillar_points": 3}, "bev.pillar_points: Input should be 1, 2, 4 or 8"),
+        ("bev", {"pillar_low": 5.0}, "bev: pillar_low has to be below pillar_high"),
+        ("bev", {"memory": {"distances": []}}, "bev.memory.distances: Tuple should have at least 1"),
+        ("depth", {"near": 40.0}, "depth: near has to be less than far"),
     ],
 )
 def test_sizes_that_no_network_can_have_are_refused_before_it_is_built(section, values, words):
@@ -81,11 +97,6 @@ def test_sizes_that_no_network_can_have_are_refused_before_it_is_built(section, 
     config[section] |= values
     with pytest.raises(UserError, match=words):
         parse_config(json.dumps(config), "here")
-
-
-def test_quirks_of_other_parts_are_refused():
-    with pytest.raises(ValidationError, match="quirks without what they are quirks of, bev 'bevformer'"):
-        PredMapNetConfig.model_validate({"quirks": {"mirrored_self_attention": True}})
 
 
 @pytest.mark.parametrize(
@@ -96,7 +107,7 @@ def test_quirks_of_other_parts_are_refused():
         ('{"wings": 2}', "wings"),
         ('{"tracking": {"tau_d": 1.5}}', "tracking.tau_d"),
         ('{"decoder": {"queries": "many"}}', "decoder.queries"),
-        ('{"history_map": {"memory": false}}', "guidance reads the memory"),
+        ('{"bev": {"quirks": {"endpoint_warp_grid": true}}}', "bev.quirks"),
         ("{", "JSON"),
     ],
 )

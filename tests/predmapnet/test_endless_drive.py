@@ -1,4 +1,4 @@
-"""What is remembered of a drive does not grow with its length."""
+"""The memory of a drive does not grow with its length."""
 
 from itertools import pairwise
 

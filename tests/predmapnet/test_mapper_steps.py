@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
@@ -16,28 +15,17 @@ from predmapnet.network.calibration import calibrate
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import StreamState
 from predmapnet.scenes import Frame
-from tests.predmapnet.network.small_baseline import small_config
+from tests.predmapnet.small_networks import small_config
 
-SMALL = {
-    "image": {"width": 64, "height": 24},
-    "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
-    "bev": {"rows": 26, "columns": 52, "widths": (16, 24, 32)},
-    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
-    "tracking": {"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02},
-}
+SURE = {"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02}
+LITE = small_config("lite", tracking=SURE)
+PAPER = small_config("paper-nuscenes", bev={"rows": 13, "columns": 26, "cameras": NUSCENES_CAMERAS}, tracking=SURE)
 
 
-PAPER = small_config(
-    "paper-nuscenes",
-    bev={"rows": 13, "columns": 26, "cameras": NUSCENES_CAMERAS},
-    tracking={"tau_d": 0.05, "tau_t": 0.05, "report_threshold": 0.02},
-).model_dump()
-
-
-@pytest.fixture(scope="module", params=[pytest.param(SMALL, id="lite"), pytest.param(PAPER, id="paper")])
+@pytest.fixture(scope="module", params=[pytest.param(LITE, id="lite"), pytest.param(PAPER, id="paper")])
 def mapper(request):
     torch.manual_seed(0)
-    network = PredMapNet(PredMapNetConfig.model_validate(request.param))
+    network = PredMapNet(request.param)
     for parameter in network.parameters():
         if parameter.abs().max() == 0:
             torch.nn.init.normal_(parameter, std=0.1)
@@ -170,14 +158,14 @@ def test_cameras_that_do_not_move_are_projected_once_and_others_anew(mapper):
         pose = DEMO_RIG[0].camera_to_ego.copy()
         pose[0, 3] += metres
         rig = (replace(DEMO_RIG[0], camera_to_ego=pose), *DEMO_RIG[1:])
-        return mapper._geometry(calibrate(rig, mapper.config))
+        return mapper.engine._geometry(calibrate(rig, mapper.config))
 
     first = geometry(0.0)
     assert geometry(0.05) is not first
     assert geometry(0.0) is first
     for step in range(20):
         geometry(0.1 + 0.01 * step)
-    assert len(mapper._geometries) <= 8
+    assert len(mapper.engine._geometries) <= 8
     assert geometry(0.0) is not first
 
 

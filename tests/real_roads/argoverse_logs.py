@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.datasets.argoverse2 import KEY_FRAME_STRIDE, Argoverse2Scene, Argoverse2Source
 from predmapnet.datasets.ground_truth.map_file import read_map_file
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import Rig
-
-Float = NDArray[np.float64]
 
 REAR_AXLE_HEIGHT = 0.33
 """Metres of the ego origin above the road: Argoverse 2 puts it at the middle of the rear axle."""

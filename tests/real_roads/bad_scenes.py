@@ -13,17 +13,15 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.own_logs.timed_poses import TimedPoses
 from predmapnet.scenes import Camera, Frame, Instant, Rig, Scene
 from tests.real_roads.image_faults import Fault, Shot
 from tests.real_roads.scene_views import ChosenFrames, SceneView, moved_rig
-
-Float = NDArray[np.float64]
 
 
 def chance(scene: Scene, what: str, seed: int) -> np.random.Generator:

@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.own_logs.calibration import CALIBRATION, write_rig
 from predmapnet.datasets.own_logs.scene import LogScene
@@ -32,7 +32,6 @@ from tests.real_roads.road_maps import Truth, drives_along, read_road_map, truth
 from tests.real_roads.scene_views import ChosenFrames, moved_rig
 from tests.real_roads.street import EVERY_IMAGE
 
-Float = NDArray[np.float64]
 T = TypeVar("T")
 FrameProgress = Callable[[int, int], None]
 

@@ -1,4 +1,4 @@
-"""What is measured of one drive over a real road, and the table of it."""
+"""Figures of one drive over a real road, and their table."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.chamfer_distance import (
@@ -24,8 +24,6 @@ from predmapnet.mapping import SceneRun
 from predmapnet.scenes import Scene
 from tests.mapfusion.calibration import share_inside, standard_errors
 from tests.mapfusion.demo_towns import MappedTown
-
-Float = NDArray[np.float64]
 
 FOUND_WITHIN = 1.0
 """Chamfer distance at which a crossing counts as found, metres."""

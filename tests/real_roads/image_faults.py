@@ -1,4 +1,4 @@
-"""What goes wrong with photographs, done to decoded images.
+"""Faults of photographs, put into decoded images.
 
 Every fault takes an RGB image ``(h, w, 3) uint8``, a :class:`Shot` and a severity from 0, and returns a new image.
 Severity 0 changes nothing; 1, 2 and 3 are the three that are measured. Lengths in pixels hold for images 800 wide and
@@ -15,9 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.scenes import Camera, Image
-
-Float = NDArray[np.float64]
 
 WIDTH = 800
 """Pixels of the width that lengths are given for."""

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.datasets.ground_truth.whole_map import join_lines
 from predmapnet.demo_world.catalogue import WORLD_VERSION
 from predmapnet.demo_world.nuscenes.map_expansion import CANVAS_EDGE
@@ -25,8 +25,6 @@ from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.world import Divider, Look, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from tests.real_roads.argoverse_logs import read_log
-
-Float = NDArray[np.float64]
 
 
 def shifted(vector_map: VectorMap, by: Float) -> VectorMap:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import arc_length, resample
 from predmapnet.datasets.ground_truth.whole_map import join_lines, truth_map
@@ -21,8 +21,6 @@ from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, LineStyle, Trajectory, VectorMap
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
 
 FRAMES = 40
 METRES_PER_FRAME = 4.0

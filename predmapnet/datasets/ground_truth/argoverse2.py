@@ -59,14 +59,7 @@ class Argoverse2GroundTruth:
     """
 
     def __init__(self, map_file: Path | Mapping[str, Any]) -> None:
-        """Read a map.
-
-        Args:
-            map_file: ``log_map_archive_*.json``, or its content.
-
-        Raises:
-            UserError: the file is missing, damaged, or not a vector map.
-        """
+        """Read ``log_map_archive_*.json``, or its content; raises UserError for anything but a vector map."""
         content, self.fingerprint = read_map_file(map_file)
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
@@ -105,14 +98,9 @@ class Argoverse2GroundTruth:
         self._right_twins = twins_of([side for side in self._right.values() if side is not None])
 
     def frame(self, ego_to_global: Float, roi: RegionOfInterest) -> FrameTruth:
-        """Return the truth around one pose.
+        """Return the truth of a region around one pose ``(4, 4)``, ego frame: crossings, dividers, boundaries.
 
-        Args:
-            ego_to_global: ``(4, 4)``, city frame; roll, pitch and height enter as in the official code.
-            roi: the region around the ego origin.
-
-        Returns:
-            Crossings, dividers, boundaries, in this order, ego frame.
+        Roll, pitch and height of the pose enter as in the official code.
         """
         patch = self.region(ego_to_global, roi)
         global_to_ego = inverse_pose(ego_to_global)
@@ -200,13 +188,9 @@ class Argoverse2GroundTruth:
         return STRtree([LineString(line) for line in self.divider_lines])
 
     def elements_within(self, area: Any) -> list[tuple[ElementKind, Float]]:
-        """Return whole elements cut by an area, city frame; dividers along a boundary are left out.
+        """Return kind and points ``(n, 2)`` of whole elements, cut by an area of the city frame.
 
-        Args:
-            area: polygon or multi polygon, city frame.
-
-        Returns:
-            Kind and ``(n, 2) float64`` points per piece.
+        Dividers along a boundary are left out.
         """
         crossings, _ = parts_of_type(shapely.intersection(shapely.force_2d(self._crossings), area), "Polygon")
         lines, _ = parts_of_type(

@@ -41,16 +41,13 @@ def code_fingerprint() -> bytes:
 
 
 def cache_key(fingerprint: bytes, poses: Sequence[Float], roi: RegionOfInterest, dataset: str) -> str:
-    """Name of a scene's ground truth.
+    """Return the name of a scene's ground truth, SHA-256 in hexadecimal.
 
     Args:
         fingerprint: digest of the map file as it lies on disk.
         poses: of each frame, as the ground truth takes them.
         roi: the region.
         dataset: whose rules are applied (``nuscenes`` or ``argoverse2``).
-
-    Returns:
-        SHA-256 in hexadecimal.
     """
     digest = hashlib.sha256()
     parts = (
@@ -71,7 +68,6 @@ class FrameByFrame(Protocol):
 
     def frame(self, pose: Float, roi: RegionOfInterest, /) -> FrameTruth:
         """Return the truth around one pose."""
-        ...
 
 
 def all_truths(
@@ -88,15 +84,9 @@ def all_truths(
 
 
 def cached_truths(folder: Path, key: str, compute: Callable[[], Sequence[FrameTruth]]) -> list[FrameTruth]:
-    """Read a scene's ground truth, or compute and keep it. A damaged file is computed and written anew.
+    """Read a scene's ground truth by its :func:`cache_key`, or compute and keep that of all frames in order.
 
-    Args:
-        folder: of the cache.
-        key: see :func:`cache_key`.
-        compute: gives the truth of every frame in order.
-
-    Raises:
-        UserError: the folder cannot be written to.
+    A damaged file is computed and written anew; a folder that cannot be written to raises UserError.
     """
     path = folder / f"truth-{key}.npz"
     with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):

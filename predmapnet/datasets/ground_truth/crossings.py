@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Bool, Float, Rows
 from predmapnet.datasets.ground_truth.patch import parts_of_type
 
 PARALLEL = 0.01
@@ -25,16 +24,10 @@ MINIMUM_COVERED_AREA = 20.0
 
 
 def merge_crossings(polygons: Sequence[Polygon]) -> list[Polygon]:
-    """Merge pieces that belong together and drop crumbs.
+    """Merge valid pieces that belong together and drop crumbs, of less than one square metre.
 
     Both passes compare a piece with the original base, not with what the base has grown to, and neither is
     repeated; two pieces with a gap between them stay two.
-
-    Args:
-        polygons: valid, non-empty pieces.
-
-    Returns:
-        Polygons of at least one square metre.
     """
     if not polygons:
         return []
@@ -51,31 +44,34 @@ def _merge_parallel(polygons: list[Polygon]) -> list[Polygon]:
     sides = _rectangle_sides(polygons)
     long_side = np.where(_norm(sides[:, 0]) > _norm(sides[:, 1]), 0, 1)
     directions = sides[np.arange(len(sides)), long_side]
-    touching = _boxes_touch(polygons)
-    absorbed = np.zeros(len(polygons), dtype=bool)
-    result = []
-    for base, polygon in enumerate(polygons):
-        if absorbed[base]:
-            continue
-        absorbed[base] = True
-        whole = polygon
-        for other in np.flatnonzero(touching[base]):
-            if absorbed[other] or 1 - _cosine(directions[base], directions[other]) >= PARALLEL:
-                continue
-            if _is_compact(polygon.union(polygons[other])):
-                whole = whole.union(polygons[other])
-                absorbed[other] = True
-        result.append(whole)
-    return result
+
+    def joins(base: int, other: int) -> bool:
+        parallel = 1 - _cosine(directions[base], directions[other]) < PARALLEL
+        return parallel and _is_compact(polygons[base].union(polygons[other]))
+
+    return _merge(polygons, np.arange(len(polygons)), joins)
 
 
 def _merge_small_pieces(polygons: list[Polygon]) -> list[Polygon]:
     """Second pass: join a smaller piece to a base whose rectangle keeps its direction, in the order of the list."""
     if len(polygons) == 1:
         return polygons
-    areas = shapely.area(polygons)
+    areas, sides = shapely.area(polygons), _rectangle_sides(polygons)
+
+    def joins(base: int, other: int) -> bool:
+        if areas[other] >= areas[base]:
+            return False
+        union = polygons[base].union(polygons[other])
+        union_sides = _rectangle_sides([union])[0]
+        cosines = np.array([_cosine(first, second) for first in sides[base] for second in union_sides])
+        return np.count_nonzero(1 - cosines < ALIGNED) == 2 and _is_compact(union)
+
+    return _merge(polygons, np.argsort(-areas, kind="stable"), joins)
+
+
+def _merge(polygons: list[Polygon], order: Rows, joins: Callable[[int, int], bool]) -> list[Polygon]:
+    """Give each piece, in the order of the list, those that touch it and join it; each is given away once."""
     touching = _boxes_touch(polygons)
-    sides = _rectangle_sides(polygons)
     absorbed = np.zeros(len(polygons), dtype=bool)
     result = []
     for base, polygon in enumerate(polygons):
@@ -83,14 +79,8 @@ def _merge_small_pieces(polygons: list[Polygon]) -> list[Polygon]:
             continue
         absorbed[base] = True
         whole = polygon
-        near = np.flatnonzero(touching[base])
-        for other in near[np.argsort(-areas[near], kind="stable")]:
-            if absorbed[other] or areas[other] >= areas[base]:
-                continue
-            union = polygon.union(polygons[other])
-            union_sides = _rectangle_sides([union])[0]
-            cosines = np.array([_cosine(first, second) for first in sides[base] for second in union_sides])
-            if np.count_nonzero(1 - cosines < ALIGNED) == 2 and _is_compact(union):
+        for other in order[touching[base][order]]:
+            if not absorbed[other] and joins(base, other):
                 whole = whole.union(polygons[other])
                 absorbed[other] = True
         result.append(whole)
@@ -129,7 +119,7 @@ def _least_rectangle(hull: Float) -> Float:
     return np.stack([along[best] * length[best], across[best] * width[best]])
 
 
-def _boxes_touch(polygons: Sequence[Polygon]) -> NDArray[np.bool_]:
+def _boxes_touch(polygons: Sequence[Polygon]) -> Bool:
     """``(n, n) bool``: whose bounding boxes meet."""
     low_x, low_y, high_x, high_y = shapely.bounds(polygons).T
     meet_x = (low_x[:, None] <= high_x[None]) & (low_x[None] <= high_x[:, None])

@@ -33,14 +33,7 @@ QUADRANT_SEGMENTS = 16
 
 @dataclass(frozen=True)
 class LaneSide:
-    """One boundary of a lane that has a neighbour on that side.
-
-    Attributes:
-        lane: id of the lane.
-        points: ``(n, 3) float64``, metres, city frame.
-        neighbour: id of the lane beyond.
-        predecessors, successors: ids of lanes.
-    """
+    """One boundary ``(n, 3)``, metres, of a lane that has a neighbour on that side; all lanes by their ids."""
 
     lane: int
     points: Float
@@ -106,10 +99,7 @@ def relinked(sides: Sides) -> Sides:
 def chain_dividers(sides: Sides) -> list[LineString]:
     """Step 6: walk the graph of boundary vertices; every simple path from a start to an end is one line.
 
-    Where lanes branch, paths overlap; a closed loop without a start gives nothing.
-
-    Returns:
-        Simplified lines with z, city frame.
+    Where lanes branch, paths overlap; a closed loop without a start gives nothing. Lines are simplified and keep z.
     """
     following: dict[Vertex3D, dict[Vertex3D, None]] = {}
     incoming: dict[Vertex3D, int] = {}
@@ -189,13 +179,9 @@ def without_repeats(lines: Sequence[LineString]) -> list[LineString]:
 
 
 def connected(lines: Sequence[Float]) -> list[Float]:
-    """Step 9: join lines whose ends meet, first line first; what joins is appended with its vertex repeated.
+    """Step 9: join lines ``(n, 3)`` whose ends meet, first line first; what joins is appended with its vertex repeated.
 
-    Args:
-        lines: ``(n, 3)`` arrays, metres.
-
-    Returns:
-        Joined lines in the order in which they were finished.
+    Lines come in the order in which they were finished.
     """
     waiting = list(lines)
     finished = []
@@ -230,9 +216,6 @@ def off_boundaries(dividers: Sequence[Float], boundaries: Sequence[Float]) -> li
 
     The official test compares an area with a length, so a divider shorter than about 1.8 m is also dropped where it
     merely crosses a boundary.
-
-    Args:
-        dividers, boundaries: ``(n, 2 or 3)`` arrays, metres, one frame.
     """
     if not dividers or not boundaries:
         return list(dividers)

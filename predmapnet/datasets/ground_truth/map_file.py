@@ -14,16 +14,9 @@ from predmapnet.errors import UserError
 
 
 def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:
-    """Read a map.
+    """Read a map, from a JSON file or its content: the content, and the SHA-256 digest of its bytes.
 
-    Args:
-        source: JSON file, or the content of one.
-
-    Returns:
-        Its content, and the SHA-256 digest of its bytes.
-
-    Raises:
-        UserError: the file is missing, damaged, or not one JSON object.
+    Raises UserError for a file that is missing, damaged, or not one JSON object.
     """
     if isinstance(source, Mapping):
         return source, hashlib.sha256(orjson.dumps(source)).digest()

@@ -36,8 +36,6 @@ from predmapnet.datasets.poses import quaternion_of
 from predmapnet.errors import UserError
 from predmapnet.scenes import FrameTruth
 
-Records = list[dict[str, Any]]
-
 
 class NuScenesGroundTruth:
     """One map of nuScenes: the ground truth around any pose.
@@ -95,10 +93,7 @@ class NuScenesGroundTruth:
     ) -> NuScenesGroundTruth:
         """Take the layers of a map that is no file; no official figures depend on it, so crossings keep their corners.
 
-        Args:
-            dividers: road dividers, then lane dividers, global frame, metres, as everything here.
-            crossings: pieces of pedestrian crossings.
-            road_segments, lanes: drivable surface.
+        ``dividers`` are road dividers, then lane dividers; segments and lanes are drivable surface. Global frame.
         """
         truth = cls.__new__(cls)
         truth.keep_corners = True
@@ -126,15 +121,10 @@ class NuScenesGroundTruth:
         }
 
     def frame(self, lidar_to_global: Float, roi: RegionOfInterest) -> FrameTruth:
-        """Return the truth around one lidar pose.
+        """Return the truth of a region around one lidar pose ``(4, 4)``: crossings, dividers, boundaries in this order.
 
-        Args:
-            lidar_to_global: ``(4, 4)``; nuScenes lidar axes (x right, y forward). Only x, y and yaw matter.
-            roi: the region, centred at the lidar.
-
-        Returns:
-            Crossings, dividers, boundaries, in this order; x forward, y left of the lidar. Pieces of the same
-            source element carry the same id.
+        x is forward, y left of the lidar, of whose pose (x right, y forward) only x, y and yaw matter. Pieces of the
+        same source element carry the same id.
         """
         centre = (float(lidar_to_global[0, 3]), float(lidar_to_global[1, 3]))
         # The official code hands the pose on as a quaternion; its last bits decide about corners of crossings.
@@ -166,14 +156,7 @@ class NuScenesGroundTruth:
         return patch_polygon(lidar_to_global[:2, 3], roi.width, roi.length, angle)
 
     def elements_within(self, area: Any) -> list[tuple[ElementKind, Float]]:
-        """Return whole elements (crossings merged, boundaries of the union) cut by an area, global frame.
-
-        Args:
-            area: polygon or multi polygon, global frame.
-
-        Returns:
-            Kind and ``(n, 2) float64`` points per piece.
-        """
+        """Return kind and points of whole elements (crossings merged, boundaries of the union) cut by an area."""
         everywhere = _Place((0.0, 0.0), rotation_about(0.0, (0.0, 0.0)))
         near = self._layers["crossings"].touching(area)
         merged = shapely.intersection(np.asarray(merge_crossings(near), dtype=object), area)
@@ -243,11 +226,7 @@ class _Place:
 
 
 def check_version(content: Mapping[str, Any], name: str) -> None:
-    """Refuse an old map expansion as the official devkit does: its maps lie elsewhere, or lack layers.
-
-    Raises:
-        UserError: the version is below 1.3, or there is none.
-    """
+    """Raise UserError for a map expansion below 1.3, as the devkit does: its maps lie elsewhere, or lack layers."""
     version = str(content.get("version", "1.0"))
     if re.fullmatch(r"\d+(\.\d+)*", version) is None or tuple(map(int, version.split("."))) < (1, 3):
         found = f"version {version}" if "version" in content else "no version"

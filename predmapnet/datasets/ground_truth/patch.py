@@ -12,12 +12,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon, STRtree
 
 from mapfusion.arrays import Float
-
-Geometries = NDArray[Any]
 
 BORDER = 0.2
 """Boundaries end this far inside the region, metres: it removes the artificial edges along the cut."""
@@ -64,14 +61,9 @@ def is_closed(line: Float, tolerance: float = CLOSED_TOLERANCE) -> bool:
 
 
 def crossing_contours(polygons: Sequence[Polygon], box: Polygon) -> list[Float | None]:
-    """Outline of each crossing inside the closed box: the ring is cut, and closed by a straight segment.
+    """Outline ``(k, 2)`` of each crossing inside the closed box: the ring is cut, and closed by a straight segment.
 
-    Args:
-        polygons: crossings; holes are ignored.
-        box: the region.
-
-    Returns:
-        Per polygon ``(k, 2) float64`` with the first vertex repeated at the end, or None if nothing is inside.
+    None for one of which nothing is inside; holes are ignored.
     """
     if not len(polygons):
         return []
@@ -138,12 +130,7 @@ def area_rings(area: Any) -> list[LineString]:
 def cut_rings(rings: Sequence[Any], region: Any) -> list[Float]:
     """Cut rings by a region and join the two parts that only the start vertex of a ring separates.
 
-    Args:
-        rings: linear rings.
-        region: polygon.
-
-    Returns:
-        List of ``(k, 2) float64``; a ring that lies inside stays closed.
+    A ring that lies inside stays closed.
     """
     cut = shapely.intersection(np.asarray(rings, dtype=object), region)
     several = shapely.get_type_id(cut) >= shapely.GeometryType.MULTIPOINT.value

@@ -48,14 +48,7 @@ def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tupl
 
 
 def mask_iou(first: Mask, second: Mask) -> Float:
-    """Intersection over union of every pair of masks.
-
-    Args:
-        first, second: ``(n, pixels)`` and ``(m, pixels)`` of 0 and 1.
-
-    Returns:
-        ``(n, m) float64``; 0 where both are empty.
-    """
+    """Intersection over union of every pair of masks ``(n, pixels)`` and ``(m, pixels)``; 0 where both are empty."""
     # Counting bits is several times as fast as a product of matrices, and starts no threads.
     first_bits, second_bits = _packed(first), _packed(second)
     together = np.bitwise_count(first_bits[:, None] & second_bits[None]).sum(axis=2, dtype=np.int64)

@@ -23,13 +23,7 @@ MINIMUM_IOU = 0.01
 
 @dataclass(frozen=True)
 class TrackFrame:
-    """Polylines of one frame, ready to be tracked.
-
-    Attributes:
-        kinds: ``(n,) int64``.
-        points: ``(n, 20, 2)``, normalised over the region.
-        ego_to_global: ``(4, 4) float64``.
-    """
+    """Polylines ``(n, 20, 2)`` of one frame, normalised over the region, ready to be tracked."""
 
     kinds: Integer
     points: Float
@@ -43,17 +37,10 @@ def track_frame(truth: FrameTruth, ego_to_global: Float, roi: RegionOfInterest) 
 
 
 def official_track_ids(frames: Sequence[TrackFrame], roi: RegionOfInterest) -> list[Integer]:
-    """Give ids to the true elements of one scene.
+    """Give ids ``(n,)`` to the true elements of all frames of one scene in order.
 
     An element inherits the id of the element of the frame before that overlaps it best after the ego motion; nothing
     is remembered for longer than one frame. Ids count from 0 within each kind, new ones in row order.
-
-    Args:
-        frames: the scene's key frames in order.
-        roi: the region.
-
-    Returns:
-        Per frame ``(n,) int64``.
     """
     ids = [np.full(len(frame.kinds), -1, dtype=np.int64) for frame in frames]
     for kind in ElementKind:
@@ -76,14 +63,9 @@ def official_track_ids(frames: Sequence[TrackFrame], roi: RegionOfInterest) -> l
 
 
 def normalised(points: Float, roi: RegionOfInterest) -> Float:
-    """Coordinates over the region: 0 at its lower left corner, just under 1 at the opposite one.
+    """Coordinates ``(..., 2)`` over the region: 0 at its lower left corner, just under 1 at the opposite one.
 
-    Args:
-        points: ``(..., 2)``, metres, ego frame.
-        roi: the region.
-
-    Returns:
-        ``(..., 2) float64``; may leave [0, 1] by rounding.
+    They may leave [0, 1] by rounding.
     """
     return (points + roi.size / 2) / (roi.size + NORMALISATION_EPSILON)
 
@@ -91,9 +73,7 @@ def normalised(points: Float, roi: RegionOfInterest) -> Float:
 def from_normalised(points: Float, roi: RegionOfInterest) -> Float:
     """Normalised points to metres, as the official tracking does it (without the epsilon of the normalisation).
 
-    Args:
-        points: ``(..., 2)`` float32 or float64; the type is kept.
-        roi: the region.
+    The type, float32 or float64, is kept.
     """
     size: Float = roi.size.astype(points.dtype)
     return np.asarray(points * size - size / 2)
@@ -110,9 +90,6 @@ def warp(
         roi: the region.
         single_precision: normalise in float32, as the official code does for ground truth; predictions are rounded
             to float32 and then normalised in float64.
-
-    Returns:
-        ``(n, k, 2)``, normalised and clipped to [0, 1], ego frame of ``now``.
     """
     metres = from_normalised(points, roi)
     lifted = np.concatenate([metres, np.zeros_like(metres[..., :1]), np.ones_like(metres[..., :1])], axis=-1)
@@ -125,15 +102,7 @@ def warp(
 
 
 def match_masks(before: Mask, now: Mask, minimum_iou: float) -> tuple[Integer, Integer]:
-    """Assign masks of two frames to each other for the greatest sum of IoU.
-
-    Args:
-        before, now: ``(n, pixels)`` and ``(m, pixels)`` of 0 and 1.
-        minimum_iou: pairs must overlap by more than this.
-
-    Returns:
-        Rows of ``before`` and of ``now`` that belong together.
-    """
+    """Assign masks of two frames to each other for the greatest sum of IoU, each above the minimum: rows of both."""
     iou = mask_iou(before, now)
     rows, columns = linear_sum_assignment(-iou)
     keep = iou[rows, columns] > minimum_iou

@@ -25,20 +25,15 @@ class MapTruth(Protocol):
 
     def region(self, pose: Float, roi: RegionOfInterest) -> Polygon:
         """Return the rectangle that a frame covers, in the global frame."""
-        ...
 
     def elements_within(self, area: Any) -> list[tuple[ElementKind, Float]]:
         """Return all elements cut by an area, global frame."""
-        ...
 
 
 def truth_map(truth: MapTruth, frames: Sequence[tuple[int, Float]], roi: RegionOfInterest) -> GlobalMap:
     """Return every element that came within reach of any frame, cut by the union of the frames' rectangles.
 
-    Args:
-        truth: of the map.
-        frames: timestamp (nanoseconds) and pose (as the map's ``frame`` takes it) of each frame.
-        roi: the region of each frame.
+    Frames are their times (nanoseconds) and poses (as the map's ``frame`` takes them).
 
     Returns:
         Crossings as merged rings, dividers joined where they run on, boundaries of the whole drivable surface;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,20 @@ MOST_CAMERAS = 8
 """Cameras that the shipped network has learned to look through at once."""
 
 
-def read_rig(path: Path) -> Rig:
+@dataclass(frozen=True)
+class LogCalibration:
+    """What ``calibration.json`` says.
+
+    Attributes:
+        rig: the cameras, undistorted.
+        poses_of: ``(4, 4)`` ``camera_to_ego`` of the camera that the poses of the log are of; None if of the car.
+    """
+
+    rig: Rig
+    poses_of: Float | None
+
+
+def read_calibration(path: Path) -> LogCalibration:
     """Read ``calibration.json``.
 
     Raises:
@@ -56,25 +70,38 @@ def read_rig(path: Path) -> Rig:
     ground_height = -_number(content, "ego_origin_above_road_m", str(path))
     rig = tuple(_camera(name, entry, ground_height, f"{path}, {name}") for name, entry in cameras.items())
     check_cameras([entry["camera_to_ego"]["rotation_wxyz"] for entry in cameras.values()], str(path))
-    return rig
+    of = content.get("poses_of")
+    if of is not None and of not in cameras:
+        raise UserError(f"{path}: 'poses_of' must be one of the cameras ({', '.join(cameras)}), not {of!r}.")
+    return LogCalibration(rig, None if of is None else _mounting(cameras[of], f"{path}, {of}"))
 
 
 def _camera(name: str, entry: Mapping[str, Any], ground_height: float, where: str) -> Camera:
     if file_name(name) != name:
         raise UserError(f"{where}: the name of a camera is that of the folder of its images, and cannot be {name!r}.")
     width, height = whole_field(entry, "width", where), whole_field(entry, "height", where)
-    stated, mounting = (entry.get(key) for key in ("intrinsics", "camera_to_ego"))
-    if not isinstance(stated, dict) or not isinstance(mounting, dict):
-        raise UserError(f"{where}: the objects 'intrinsics' and 'camera_to_ego' are expected.")
+    stated = _object(entry, "intrinsics", where)
     fx, fy, cx, cy = (_number(stated, key, f"{where}, intrinsics") for key in ("fx", "fy", "cx", "cy"))
     intrinsics = np.array([[fx, 0.0, cx + HALF_A_PIXEL], [0.0, fy, cy + HALF_A_PIXEL], [0.0, 0.0, 1.0]])
     check_principal_point(intrinsics, width, height, where)
-    rotation = numbers_field(mounting, "rotation_wxyz", (4,), f"{where}, camera_to_ego")
-    translation = numbers_field(mounting, "translation_m", (3,), f"{where}, camera_to_ego")
-    pose = pose_matrix(rotation.tolist(), translation.tolist(), where)
-    camera = Camera(name, width, height, intrinsics, pose, ground_height)
+    camera = Camera(name, width, height, intrinsics, _mounting(entry, where), ground_height)
     model, distortion = _lens(entry, where)
     return camera if distortion is None else undistorted_camera(camera, model, distortion, where)
+
+
+def _mounting(entry: Mapping[str, Any], where: str) -> Float:
+    mounting, where = _object(entry, "camera_to_ego", where), f"{where}, camera_to_ego"
+    rotation, translation = (
+        numbers_field(mounting, name, (size,), where) for name, size in (("rotation_wxyz", 4), ("translation_m", 3))
+    )
+    return pose_matrix(rotation.tolist(), translation.tolist(), where)
+
+
+def _object(entry: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    found = entry.get(name)
+    if not isinstance(found, dict):
+        raise UserError(f"{where}: an object '{name}' is expected.")
+    return found
 
 
 def _lens(entry: Mapping[str, Any], where: str) -> tuple[str, Float | None]:

@@ -16,8 +16,9 @@ from predmapnet.datasets.argoverse2_files import IMAGE_ENDINGS, timed_files
 from predmapnet.datasets.fields import numbers_field
 from predmapnet.datasets.georeference import local_frame, plane_at
 from predmapnet.datasets.large_tables import parse_json
-from predmapnet.datasets.own_logs.calibration import CALIBRATION, read_rig
-from predmapnet.datasets.own_logs.timed_poses import TimedPoses, read_timed_poses
+from predmapnet.datasets.own_logs.calibration import CALIBRATION, read_calibration
+from predmapnet.datasets.own_logs.pose_files import read_timed_poses
+from predmapnet.datasets.own_logs.timed_poses import TimedPoses
 from predmapnet.datasets.own_logs.truth import Lines, read_truth, truth_around, truth_of_drive
 from predmapnet.errors import UserError
 from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Rig, SceneInfo
@@ -56,8 +57,9 @@ class LogScene:
             UserError: a file is missing or damaged, or images and poses are not of the same time.
         """
         self.folder = folder
-        self.rig: Rig = read_rig(folder / CALIBRATION)
-        self.poses: TimedPoses = read_timed_poses(folder)
+        calibration = read_calibration(folder / CALIBRATION)
+        self.rig: Rig = calibration.rig
+        self.poses: TimedPoses = read_timed_poses(folder, calibration.poses_of)
         self.georeference = _georeference(folder / "georeference.json")
         self.timestamps: Integer = self._instants(rate)
         self.info = SceneInfo(folder.resolve().name, split, len(self.timestamps), "", description=self._left_out())

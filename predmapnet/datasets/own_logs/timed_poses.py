@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mapfusion.arrays import Bool, Float, Integer
-from predmapnet.datasets.log_checks import check_clock, check_drive
-from predmapnet.datasets.pose_rows import csv_pose_rows, nanoseconds, time_column
-from predmapnet.datasets.poses import pose_matrix
-from predmapnet.errors import UserError
 from predmapnet.files import write_file
 
-HOW = (
-    "Each row needs timestamp_ns (or timestamp_us, timestamp_ms, timestamp_s), x, y, z in metres and qw, qx, qy, qz, "
-    "or yaw in radians (docs/own-logs.md)"
-)
 LONGEST_GAP = 1_000_000_000
 """Poses farther apart say nothing about the way between them, nanoseconds."""
 FARTHEST_BEYOND = 100_000_000
@@ -66,45 +57,6 @@ class TimedPoses:
             return np.asarray(inside)
         after = np.searchsorted(self.timestamps, timestamps, side="right").clip(1, len(self.timestamps) - 1)
         return np.asarray(inside & (self.timestamps[after] - self.timestamps[after - 1] <= LONGEST_GAP))
-
-
-def read_timed_poses(folder: Path) -> TimedPoses:
-    """Read the poses of a log.
-
-    Raises:
-        UserError: there is no such file, it is damaged, two poses have one time, or no car drives so.
-    """
-    path = folder / "poses.csv"
-    if not path.is_file():
-        raise UserError(f"There is no {path}: it says where the car was. {HOW}.")
-    return _poses_of(csv_pose_rows(path, HOW), path)
-
-
-def _poses_of(rows: Sequence[tuple[str, Mapping[str, Any]]], path: Path) -> TimedPoses:
-    if not rows:
-        raise UserError(f"{path} holds no pose. {HOW}.")
-    timestamps = np.array([_time(row, f"{path}, {place}") for place, row in rows], dtype=np.int64)
-    poses = np.array([pose_matrix(row["rotation"], row["translation"], f"{path}, {place}") for place, row in rows])
-    order = np.argsort(timestamps, kind="stable")
-    repeated = np.flatnonzero(np.diff(timestamps[order]) == 0)
-    if len(repeated):
-        places = " and ".join(rows[row][0] for row in order[repeated[0] : repeated[0] + 2].tolist())
-        raise UserError(f"{path}: the poses of {places} have the same time. Are the times rounded?")
-    quaternions = np.array([rows[row][1]["rotation"] for row in order.tolist()], dtype=np.float64)
-    found = TimedPoses(timestamps[order], poses[order])
-    check_clock(found.timestamps, found.ego_to_global[:, :2, 3], "nanoseconds", str(path))
-    check_drive(quaternions, found.ego_to_global[:, :2, 3], str(path))
-    return found
-
-
-def _time(row: Mapping[str, Any], where: str) -> int:
-    column = time_column(row)
-    if row.get(column) is None:
-        raise UserError(f"{where}: the time is missing. {HOW}.")
-    try:
-        return nanoseconds(row[column], column)
-    except ValueError as error:
-        raise UserError(f"{where}: {error}. {HOW}.") from error
 
 
 def write_timed_poses(path: Path, poses: TimedPoses) -> None:

@@ -12,10 +12,10 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.nuscenes.tables import token
 from predmapnet.demo_world.world import Divider, LineStyle, VectorMap
 
-Float = NDArray[np.float64]
 Record = dict[str, Any]
 
 CANVAS_EDGE = (800.0, 800.0)
@@ -78,13 +78,10 @@ def _open_ring(ring: shapely.LinearRing) -> Float:
 
 
 def build_expansion(name: str, vector_map: VectorMap) -> dict[str, Any]:
-    """The content of ``maps/expansion/<location>.json``.
+    """Return the content of ``maps/expansion/<location>.json``; tokens depend on the name of the scene.
 
-    Layers that a vector map knows nothing of (road blocks, lane connectors, traffic lights) are empty.
-
-    Args:
-        name: of the scene; tokens depend on it.
-        vector_map: metres, all coordinates inside :data:`CANVAS_EDGE`.
+    Layers that a vector map knows nothing of (road blocks, lane connectors, traffic lights) are empty. All coordinates
+    lie inside :data:`CANVAS_EDGE`.
     """
     sheet = _Sheet(name)
     segments = sheet.polygon_layer("road_segment", vector_map.road_segments)

@@ -6,15 +6,13 @@ import hashlib
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.demo_world.world import Trajectory, World
 from predmapnet.scenes import Rig
 
-Float = NDArray[np.float64]
 Record = dict[str, Any]
 
 LIDAR = "LIDAR_TOP"
@@ -35,15 +33,7 @@ def sample_file_name(scene: str, channel: str, timestamp: int) -> str:
 
 
 def build_tables(world: World, rig: Rig) -> dict[str, list[Record]]:
-    """All tables by name.
-
-    Args:
-        world: the scene.
-        rig: its cameras.
-
-    Returns:
-        For each table its records, linked by tokens that depend only on the scene's name.
-    """
+    """Return the records of all tables by name, linked by tokens that depend only on the scene's name."""
     name = world.name
     channels = [camera.name for camera in rig] + [LIDAR]
     return {

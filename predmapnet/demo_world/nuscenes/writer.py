@@ -35,14 +35,8 @@ def write_scene(
 ) -> None:
     """Render a world and write it as ``folder``, which appears at once and complete, or not at all.
 
-    Two processes may write the same scene at the same time: the first one wins.
-
-    Args:
-        world: what to render.
-        folder: root of the new data set; its parents are made.
-        world_version: noted in ``demo_world.json``.
-        rig: the cameras.
-        progress: called once per key frame.
+    Two processes may write the same scene at the same time: the first one wins. ``world_version`` is noted in
+    ``demo_world.json``, and ``progress`` is called once per key frame.
 
     Raises:
         UserError: the folder cannot be written.

@@ -7,13 +7,9 @@ Colours are stored as square roots of linear albedo, eight bits each: the eye's 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Byte, Float, Float32
 from predmapnet.demo_world.render.jit import kernel
-
-Byte = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 
 @kernel

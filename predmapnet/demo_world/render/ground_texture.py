@@ -12,15 +12,13 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Byte, Float
 from predmapnet.demo_world.render.ground_kernels import compose, fill_materials, fill_paint, halve
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.paint import paint_quads, ribbon
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
 from predmapnet.demo_world.street.looks import Light
 from predmapnet.demo_world.world import World
-
-Byte = NDArray[np.uint8]
-Float = NDArray[np.float64]
 
 FINE_MARGIN = 50.0
 """Metres around the trajectory that are painted finely."""
@@ -226,7 +224,7 @@ def _pyramid(
     light: Light,
     road: shapely.Geometry,
     dark: _Darkness,
-    quads: tuple[Float, Float],
+    painted: tuple[Float, Float],
     near: Float | None,
 ) -> Pyramid:
     material = np.full((sheet.rows, sheet.columns), _INDEX["grass"], dtype=np.uint8)
@@ -248,15 +246,10 @@ def _pyramid(
     fill_materials(material, local[0], local[1], sheet.texel, table, fractal, white, occlusion, shadow, base)
 
     paint = np.zeros((sheet.rows, sheet.columns, 3), dtype=np.uint8)
-    corners, attributes = quads
+    corners, attributes = painted
     attributes = attributes * [1.0, 1 - 0.35 * light.wetness, 1.0]
-    fill_paint(
-        sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2),
-        attributes,
-        sheet.texel,
-        fractal_tile(0.75, seed=9),
-        paint,
-    )
+    quads = sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2)
+    fill_paint(quads, attributes, sheet.texel, fractal_tile(0.75, seed=9), paint)
 
     sizes = [(sheet.rows >> level, sheet.columns >> level) for level in range(LEVELS + 1)]
     counts = np.array([rows * columns for rows, columns in sizes])
@@ -272,15 +265,9 @@ def _pyramid(
 
 
 def paint_ground(world: World, light: Light, texel: float = FINE_TEXEL) -> tuple[Pyramid, Pyramid]:
-    """Paint the ground of a world.
+    """Paint the ground: the fine texture near the trajectory (``texel`` metres), the coarse one of all in sight.
 
-    Args:
-        world: map, surfaces, solids (for shadows) and trajectory.
-        light: decides shadows and how wet surfaces darken.
-        texel: side of the fine texture's cells, metres.
-
-    Returns:
-        The fine texture near the trajectory and the coarse one of everything in sight.
+    The light decides the shadows of solids and how wet surfaces darken.
     """
     poses = world.trajectory.ego_to_global
     positions = poses[:, :2, 3]

@@ -5,20 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Byte, Float, Float32, Integer, Integer32
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import kernel, part
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.raster import Vector, View, ball_depth, face_plane, pixel_ray
 from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
 from predmapnet.demo_world.street.looks import Light
-
-Byte = NDArray[np.uint8]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Integer = NDArray[np.int64]
-Integer32 = NDArray[np.int32]
 
 
 class Surroundings(NamedTuple):
@@ -326,14 +320,13 @@ def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image
 def develop(
     image: Float32, exposures: Float32, vignette: float, noise: float, seed: int, curve: Byte, out: Byte
 ) -> None:
-    """Expose, add sensor noise and apply the tone curve.
+    """Expose an image ``(height, width, 3)`` of linear radiance, add sensor noise and apply the tone curve: ``out``.
 
     Args:
-        image: ``(height, width, 3)`` linear radiance.
+        image: changed in place.
         exposures: ``(3,)``, factors of red, green and blue.
         vignette: share of light that the corners lose.
-        noise: standard deviation at middle grey.
-        seed: of the noise.
+        noise, seed: standard deviation at middle grey, and of what it is drawn.
         curve: ``(4096,)``, from the square root of linear light (0 to 1.25) to sRGB bytes.
         out: ``(height, width, 3)``.
     """

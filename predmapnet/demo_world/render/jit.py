@@ -1,4 +1,4 @@
-"""How the inner loops are compiled: machine code that is kept between runs, on one thread each."""
+"""Compilation of the inner loops: machine code that is kept between runs, on one thread each."""
 
 from __future__ import annotations
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.scenes import Camera
-
-Float = NDArray[np.float64]
 
 BEAMS = 32
 AZIMUTHS = 1080
@@ -48,12 +47,7 @@ def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float
 
 
 def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EGO) -> NDArray[np.float32]:
-    """Sweep the scene once.
-
-    Args:
-        renderer: of the world.
-        frame_index: key frame.
-        lidar_to_ego: ``(4, 4)``; lidar axes as in nuScenes: x right, y forward, z up.
+    """Sweep the scene once at a key frame; lidar axes are those of nuScenes: x right, y forward, z up.
 
     Returns:
         ``(n, 5) float32``: x, y, z in metres, lidar frame; intensity in [0, 255]; ring in [0, 31]. Rays that meet

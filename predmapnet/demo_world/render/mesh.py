@@ -7,18 +7,17 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Integer
 from predmapnet.demo_world.world import Solids
 
-Float = NDArray[np.float64]
 Corners = list[tuple[float, float, float]]
 
 MOST_CORNERS = 8
 
 
 class Material(IntEnum):
-    """How a face is shaded."""
+    """Shading of a face."""
 
     PLAIN = 0
     FACADE = 1
@@ -48,14 +47,14 @@ class Mesh(NamedTuple):
     """
 
     corners: Float
-    counts: NDArray[np.int64]
+    counts: Integer
     normals: Float
-    materials: NDArray[np.int64]
-    owners: NDArray[np.int64]
+    materials: Integer
+    owners: Integer
     colours: Float
     balls: Float
-    ball_materials: NDArray[np.int64]
-    ball_owners: NDArray[np.int64]
+    ball_materials: Integer
+    ball_owners: Integer
     ball_colours: Float
 
 
@@ -63,8 +62,8 @@ class _Template(NamedTuple):
     """Faces of a unit solid (x, y in [-0.5, 0.5], z in [0, 1]); a negative tint means the solid's own colour."""
 
     corners: Float
-    counts: NDArray[np.int64]
-    materials: NDArray[np.int64]
+    counts: Integer
+    materials: Integer
     tints: Float
 
 
@@ -216,14 +215,8 @@ def _box() -> _Template:
     return _template([(face, Material.PLAIN, None) for face in faces])
 
 
-_MATERIALS = {
-    "plain": Material.PLAIN,
-    "facade": Material.FACADE,
-    "foliage": Material.FOLIAGE,
-    "bark": Material.BARK,
-    "lamp": Material.LAMP,
-    "sign": Material.SIGN,
-}
+_TEXTURES = ("plain", "facade", "foliage", "bark", "lamp", "sign")
+"""Textures of solids that are called like their material."""
 
 
 def _select(solids: Solids, row: int) -> _Template:
@@ -236,16 +229,8 @@ def _select(solids: Solids, row: int) -> _Template:
     return _prism(8) if solids.shape[row] == "cylinder" else _box()
 
 
-def build_mesh(solids: Solids, rows: NDArray[np.int64]) -> Mesh:
-    """Turn solids into faces.
-
-    Args:
-        solids: all solids.
-        rows: ``(k,)``, which of them to take, at the positions they have in ``solids``.
-
-    Returns:
-        Their mesh; ``owners`` refer to rows of ``solids``.
-    """
+def build_mesh(solids: Solids, rows: Integer) -> Mesh:
+    """Turn rows ``(k,)`` of solids into faces; ``owners`` of the mesh refer to rows of ``solids``."""
     flat = [int(row) for row in rows if solids.shape[row] != "ellipsoid"]
     templates = [_select(solids, row) for row in flat]
     repeats = np.array([len(template.counts) for template in templates], dtype=np.int64)
@@ -276,8 +261,8 @@ def build_mesh(solids: Solids, rows: NDArray[np.int64]) -> Mesh:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     plain = (materials == Material.PLAIN) & (tints[:, 0] < 0)
     own = np.full(len(solids.texture), int(Material.PLAIN), dtype=np.int64)
-    for texture, material in _MATERIALS.items():
-        own[solids.texture == texture] = material
+    for texture in _TEXTURES:
+        own[solids.texture == texture] = Material[texture.upper()]
     materials[plain] = own[owners[plain]]
     materials[(materials == Material.FACADE) & (normals[:, 2] > 0.5)] = Material.ROOF
     colours = np.where(tints < 0, solids.colour[owners], tints)

@@ -13,14 +13,9 @@ TILE = 1024
 
 @lru_cache(maxsize=8)
 def fractal_tile(roughness: float, seed: int = 7) -> NDArray[np.float32]:
-    """Noise with the spectrum ``1 / f ** roughness``, values spread evenly.
+    """Return periodic noise ``(TILE, TILE) float32`` in [0, 1], every value equally frequent.
 
-    Args:
-        roughness: 0 is white noise, 2 is smooth like clouds.
-        seed: another tile of the same kind.
-
-    Returns:
-        ``(TILE, TILE) float32`` in [0, 1], periodic, every value equally frequent.
+    Its spectrum is ``1 / f ** roughness``: 0 is white noise, 2 is smooth like clouds.
     """
     white = np.random.default_rng(seed).standard_normal((TILE, TILE))
     frequency = np.hypot(np.fft.fftfreq(TILE)[:, None], np.fft.rfftfreq(TILE)[None, :])

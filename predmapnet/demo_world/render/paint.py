@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import LineString, Polygon
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.world import Crossing, CrossingStyle, Divider, Hatching, LineStyle, VectorMap
-
-Float = NDArray[np.float64]
 
 DOUBLE_GAP = 0.15
 """Metres of asphalt between the two lines of a double divider."""
@@ -223,11 +221,9 @@ def _paint_parking(quads: Quads, bay: Polygon, generator: np.random.Generator) -
 
 
 def paint_quads(vector_map: VectorMap, seed: int) -> tuple[Float, Float]:
-    """Lay out all paint of a map.
+    """Lay out all paint of a map: dividers, markings, hatchings, crossings, stop lines and parking bays.
 
-    Args:
-        vector_map: dividers, markings, hatchings, crossings, stop lines and parking bays are painted.
-        seed: decides widths, gaps, age and wear of each element.
+    The seed decides widths, gaps, age and wear of each element.
 
     Returns:
         ``(n, 4, 2) float64`` corners, metres, and ``(n, 3) float64``: wear, albedo, yellow or white.

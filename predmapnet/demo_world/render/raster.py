@@ -11,12 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32, Integer, Integer32
 from predmapnet.demo_world.render.jit import kernel, part
 
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Integer = NDArray[np.int64]
-Integer32 = NDArray[np.int32]
 Vector = tuple[float, float, float]
 
 NEAR = 0.12
@@ -135,15 +132,10 @@ def draw_faces(
     corners: Float, counts: Integer, normals: Float, view: View, samples: int, scratch: Float, nearness: Float32,
     ids: Integer32,
 ) -> None:  # fmt: skip
-    """Draw all faces.
+    """Draw all faces of a mesh into a z-buffer ``(samples * height, samples * width)``.
 
-    Args:
-        corners, counts, normals: as in :class:`predmapnet.demo_world.render.mesh.Mesh`.
-        view: the camera.
-        samples: per pixel and direction.
-        scratch: ``(18, 3)``, overwritten.
-        nearness: ``(samples * height, samples * width)``: largest ``1 / depth`` so far, changed in place.
-        ids: same shape: face that is nearest, -1 for none, changed in place.
+    Of each sample ``nearness`` keeps the largest ``1 / depth`` and ``ids`` the face that has it, -1 for none;
+    ``scratch (18, 3)`` is overwritten.
     """
     screen = scratch[8:]
     rows, columns = nearness.shape
@@ -201,14 +193,9 @@ def draw_balls(
     balls: Float, leafy: Integer, first_id: int, view: View, samples: int, noise: Float32, nearness: Float32,
     ids: Integer32,
 ) -> None:  # fmt: skip
-    """Draw ellipsoids; those marked ``leafy`` have a ragged outline with gaps.
+    """Draw ellipsoids ``(b, 7)``, the first of id ``first_id``; ``leafy (b,)`` ones have a ragged outline with gaps.
 
-    Args:
-        balls: ``(b, 7)`` as in :class:`predmapnet.demo_world.render.mesh.Mesh`.
-        leafy: ``(b,)``, 1 for foliage.
-        first_id: id of the first ball.
-        view, samples, nearness, ids: as in :func:`draw_faces`.
-        noise: tile in [0, 1].
+    ``noise`` is a tile in [0, 1]; the rest is as in :func:`draw_faces`.
     """
     rows, columns = nearness.shape
     position, rotation = view.position, view.rotation

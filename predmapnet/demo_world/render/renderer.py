@@ -1,15 +1,16 @@
-"""What a camera sees: images with exact depth of a world, at any resolution."""
+"""Renderer: images of a world with exact depth, at any resolution."""
 
 from __future__ import annotations
 
 import zlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, paint_ground
 from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
@@ -22,17 +23,10 @@ from predmapnet.demo_world.street.looks import Light, light_of
 from predmapnet.demo_world.world import Solids, World
 from predmapnet.scenes import Camera, Rig
 
-Float = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """One image of one camera.
-
-    Attributes:
-        image: ``(height, width, 3) uint8``, RGB.
-        depth: ``(height, width) float32``, metres along the optical axis at the pixel's centre, infinite for sky.
-    """
+    """One image ``(height, width, 3) uint8``, RGB, and its depth, metres along the optical axis, infinite for sky."""
 
     image: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -136,17 +130,7 @@ class Renderer:
         present = np.ones(len(centre), dtype=bool)
         if solids.lifetime is not None:
             present = (solids.lifetime[:, 0] <= seconds) & (seconds < solids.lifetime[:, 1])
-        placed = Solids(
-            solids.shape,
-            centre,
-            solids.size,
-            solids.yaw,
-            solids.colour,
-            solids.texture,
-            solids.velocity,
-            solids.lifetime,
-        )
-        return placed, np.flatnonzero(present)
+        return replace(solids, centre=centre), np.flatnonzero(present)
 
     def mesh_at(self, frame_index: int) -> tuple[Mesh, Solids, NDArray[np.int64]]:
         """Return the mesh of a key frame, the solids in place, and the rows of those that move."""
@@ -189,18 +173,9 @@ class Renderer:
     def view(self, camera: Camera, frame_index: int) -> View:
         """Return a camera at a key frame as plain numbers."""
         pose = self.world.trajectory.ego_to_global[frame_index] @ camera.camera_to_ego
-        k = camera.intrinsics
         rotation, position = np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3])
-        return View(
-            rotation,
-            position,
-            float(k[0, 0]),
-            float(k[1, 1]),
-            float(k[0, 2]),
-            float(k[1, 2]),
-            camera.width,
-            camera.height,
-        )
+        fx, fy, cx, cy = (float(camera.intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return View(rotation, position, fx, fy, cx, cy, camera.width, camera.height)
 
     def rasterise(self, mesh: Mesh, view: View, samples: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return the z-buffer of the solids: ``1 / depth`` and ids, ``(samples * height, samples * width)``."""
@@ -212,14 +187,9 @@ class Renderer:
         return nearness, ids
 
     def render(self, camera: Camera, frame_index: int) -> RenderedImage:
-        """Draw what ``camera`` sees at a key frame.
+        """Draw what a camera sees at a key frame; the same bytes for the same world, camera and frame.
 
-        Args:
-            camera: any pinhole camera without skew; its intrinsics hold for its width and height.
-            frame_index: index into the world's trajectory.
-
-        Returns:
-            The image and its depth; the same bytes for the same world, camera and frame.
+        Any pinhole camera without skew will do; its intrinsics hold for its width and height.
         """
         return self._draw(camera, frame_index, self._moment(frame_index))
 

@@ -1,14 +1,12 @@
-"""How a car's cameras turn light into bytes: exposure, white balance and tone curve."""
+"""Camera response, from light to bytes: exposure, white balance and tone curve."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Byte = NDArray[np.uint8]
+from mapfusion.arrays import Byte, Float
 
 CURVE_LENGTH = 4096
 CURVE_END = 1.25

@@ -1,16 +1,14 @@
-"""What a sample looks like: the ground's texture, the sky, walls, cars and leaves, in linear light."""
+"""Shading of a sample: the ground's texture, the sky, walls, cars and leaves, in linear light."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import part
 from predmapnet.demo_world.street.looks import Light
 
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Texel = tuple[float, float, float, float]
 
@@ -88,7 +86,7 @@ def read_ground(
     fine: Pyramid, coarse: Pyramid, white: Float32, x: float, y: float, ux: float, uy: float, vx: float, vy: float,
     most: int,
 ) -> Texel:  # fmt: skip
-    """Filter the ground over a pixel's footprint.
+    """Filter the ground over a pixel's footprint: linear albedo and the share of sunlight that arrives.
 
     Args:
         fine, coarse: textures.
@@ -96,9 +94,6 @@ def read_ground(
         x, y: where the pixel's centre meets the ground, metres.
         ux, uy, vx, vy: how that point moves per pixel to the right and down, metres.
         most: largest number of samples along the footprint's long axis.
-
-    Returns:
-        Linear red, green, blue albedo and the share of sunlight that arrives.
     """
     # Axes of the ellipse that the pixel covers: eigenvectors of J J^T (EWA filtering, Heckbert 1989).
     a, b, c = ux * ux + vx * vx, uy * uy + vy * vy, ux * uy + vx * vy
@@ -200,7 +195,7 @@ def facade(
     light: Light, fractal: Float32, owner: int, along: float, height: float, blur: float, red: float, green: float,
     blue: float,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """A wall with rows of windows.
+    """A wall with rows of windows: its albedo, share of glass and light from inside.
 
     Args:
         light: for the share of lit windows.
@@ -209,9 +204,6 @@ def facade(
         along, height: metres along the wall and above the ground.
         blur: size of a pixel on the wall, metres.
         red, green, blue: albedo of the wall.
-
-    Returns:
-        Albedo, share of glass and light from inside.
     """
     style = _hash(owner, 3, 7)
     pitch = 1.9 + 2.2 * _hash(owner, 5, 11)

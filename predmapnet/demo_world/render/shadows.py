@@ -1,4 +1,4 @@
-"""Where things that stand on the ground darken it: outlines of their feet and of the shadows they cast."""
+"""Shadows on the ground: outlines of the feet of things that stand there, and of the shadows they cast."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.world import Solids
-
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 LEAFY_SHADE = 64
 """Light left in the shadow of leaves, [0, 255]; flecks of sun are drawn where it is neither 0 nor 255."""
@@ -29,24 +27,16 @@ def _outline(solids: Solids, index: int, grow: float = 0.0) -> Float:
 
 
 def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Float, int]]:
-    """Ground below and close to things, and how much of the sky's light is left there, [0, 255].
-
-    Args:
-        solids: all solids of the world.
-        mask: ``(n,) bool``, which to take.
-    """
+    """Ground below and close to the solids of a mask, and how much of the sky's light is left there, [0, 255]."""
     low = solids.centre[:, 2] - solids.size[:, 2] / 2
     rows = np.flatnonzero(mask & (low < 0.4)).tolist()
     return [(_outline(solids, row, 0.12), 38 if solids.texture[row] == "vehicle" else 128) for row in rows]
 
 
 def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Float32) -> list[tuple[Float, int]]:
-    """Convex outlines of the cast shadows on the plane z = 0, ``(k, 2)`` metres each, and the light left, [0, 255].
+    """Outlines ``(k, 2)``, metres, of the shadows of a mask's solids on the plane z = 0, and the light left, [0, 255].
 
-    Args:
-        solids: all solids of the world.
-        mask: ``(n,) bool``, which to take.
-        sun_direction: ``(3,)``, unit vector towards the sun, above the horizon.
+    ``sun_direction`` is a unit vector towards the sun, above the horizon.
     """
     slope = -np.asarray(sun_direction[:2], dtype=np.float64) / max(float(sun_direction[2]), 0.05)
     # Slices of an ellipsoid: their heights and how much narrower they are than its middle, three of them above it.

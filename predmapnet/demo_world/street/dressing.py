@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.street.solid_list import SolidList
 from predmapnet.demo_world.street.traffic import Parking, add_moving_traffic, ego_corridor, footprint
 from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
-
-Float = NDArray[np.float64]
 
 SIGHT = 110.0
 """Metres from the trajectory within which things are put up."""
@@ -158,17 +156,14 @@ def _put_up_furniture(
 
 
 def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, name: str) -> World:
-    """Make up everything that a vector map does not hold.
+    """Make up everything that a vector map does not hold; the same seed gives the same world.
 
     Args:
         vector_map: what is true about the road; lanes, walkways and parking bays may be missing (real maps).
         trajectory: things are put up within sight of it, and nothing stands or drives in its way.
         look: light and weather.
-        seed: the same seed gives the same world.
+        seed: of all that is drawn by chance.
         name: of the scene.
-
-    Returns:
-        A world that :class:`predmapnet.demo_world.render.renderer.Renderer` draws.
     """
     generator = np.random.default_rng([seed, 31])
     positions = trajectory.ego_to_global[:, :2, 3]

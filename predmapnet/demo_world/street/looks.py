@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float32
 from predmapnet.demo_world.world import Look
-
-Float32 = NDArray[np.float32]
 
 
 class Light(NamedTuple):
@@ -90,12 +88,7 @@ def light_of(look: Look, seed: int) -> Light:
 
 
 def harder_light(light: Light, seed: int) -> Light:
-    """Return the light of a training scene: often haze or fog, a low sun, or a sun half behind clouds.
-
-    Args:
-        light: of :func:`light_of`.
-        seed: of the scene.
-    """
+    """Return the light of a training scene: often haze or fog, a low sun, or a sun half behind clouds."""
     generator = np.random.default_rng([seed, 103])
     kind, strength = generator.uniform(size=2)
     if kind < 0.12:

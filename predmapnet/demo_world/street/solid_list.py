@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.world import Solids
 
-Float = NDArray[np.float64]
 Colour = tuple[float, float, float]
 Vector = Sequence[float] | Float
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 from shapely.affinity import rotate, translate
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.street.solid_list import Colour, SolidList
 from predmapnet.demo_world.world import Trajectory, VectorMap
-
-Float = NDArray[np.float64]
 
 _LACQUERS: list[Colour] = [
     (0.62, 0.62, 0.62), (0.62, 0.62, 0.60), (0.30, 0.31, 0.32), (0.12, 0.125, 0.13), (0.03, 0.03, 0.033),

@@ -23,8 +23,7 @@ def assemble(
 ) -> tuple[VectorMap, Polygon]:
     """Cut islands out of the pavement and divide it into stretches and junctions.
 
-    Returns:
-        The map, and the whole paved surface without islands.
+    Returns the map, and the whole paved surface without islands.
     """
     outline = _outline(works)
     islands = shapely.union_all(works.islands).intersection(outline.buffer(-0.8))

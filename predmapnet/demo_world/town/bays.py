@@ -115,13 +115,9 @@ def _open_left_bays(
 
 
 def _left_bay(random: Generator, base: Strip, bay: tuple[float, int, float, float, float], taken: float) -> Strip:
-    """A bay for left turns that takes its width from the middle, or opens beside a hatched taper.
+    """Return a bay for left turns that takes ``taken`` metres from the middle, or opens beside a hatched taper.
 
-    Args:
-        random: decides whether the taper is hatched.
-        base: what is in the middle of the street; it gives way.
-        bay: station of the node, direction back from it, length, taper and width of the bay.
-        taken: width that the bay takes from ``base``, metres.
+    ``bay`` is the station of the node, the direction back from it, and length, taper and width of the bay.
     """
     station, back, hold, taper, width = bay
     strip = Strip(Use.LANE, -back, 0.0)

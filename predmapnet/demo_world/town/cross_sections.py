@@ -1,4 +1,4 @@
-"""What a street looks like across: strips side by side whose widths change along the way."""
+"""Cross-sections of streets: strips side by side whose widths change along the way."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.street_plan import Rank
 from predmapnet.demo_world.world import LineStyle
-
-Float = NDArray[np.float64]
 
 ACTIVE = 0.6
 """A strip narrower than this is not there, metres."""
 
 
 class Use(StrEnum):
-    """What a strip is for."""
+    """Use of a strip."""
 
     LANE = "lane"
     BUS = "bus"

@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.junctions import Junction
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.town.street_plan import Rank, StreetPlan
 from predmapnet.demo_world.world import Crossing
-
-Float = NDArray[np.float64]
 
 MOST_SKEW = np.radians(30.0)
 
@@ -119,16 +117,10 @@ def _between_kerbs(
     limits: tuple[float, float],
     habits: Habits,
 ) -> Crossing | None:
-    """A crossing through a place on the road, from kerb to kerb.
+    """Return a crossing through a place on the paved surface, from kerb to kerb, ``depth`` metres deep.
 
-    Args:
-        random: jitters its sides.
-        surface: paved.
-        centre: ``(2,)`` metres.
-        walk: direction of walking, to the left seen from the junction, radians.
-        depth: metres.
-        limits: how far it may reach to the left and to the right of its centre, metres.
-        habits: of the town.
+    ``walk`` is the direction of walking, to the left seen from the junction, in radians; ``limits`` are how far it may
+    reach to the left and to the right of its centre.
     """
     sides = []
     for sign in (-0.5, 0.5):

@@ -1,16 +1,14 @@
-"""How a car follows a path: arcs that join lanes, speeds that a person would drive, and the poses that follow."""
+"""Drives along a path: arcs that join lanes, speeds that a person would drive, and the poses that follow."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.world import Trajectory
-
-Float = NDArray[np.float64]
 
 KEY_FRAMES = 40
 FRAME_SECONDS = 0.5
@@ -28,14 +26,10 @@ FRONT_OVERHANG = 4.0
 
 
 def drive_along_path(random: Generator, path: Float, stops: Float, cruise: float, seed: int) -> Trajectory:
-    """Drive along a path and note the pose twice a second.
+    """Drive along a path ``(n, 2)`` of the rear axle, every :data:`PATH_STEP` metres, and note the pose twice a second.
 
-    Args:
-        random: decides where the car waits, and its pitch and roll.
-        path: ``(n, 2)`` of the rear axle, every :data:`PATH_STEP` metres.
-        stops: distances along it at which a car may have to stop.
-        cruise: highest speed, metres per second.
-        seed: of the scene; sets the time.
+    ``stops`` are distances along it at which the car may have to stop, ``cruise`` is its highest speed in m/s, and the
+    seed sets the time.
     """
     stations = _drive_along(random, path, stops, cruise)
     travelled = arc_length(path)

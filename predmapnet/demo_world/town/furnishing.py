@@ -1,13 +1,13 @@
-"""What stands and lies along a stretch of street besides paint: medians, openings of the kerb, parking and lanes."""
+"""Furnishing of a stretch of street besides its paint: medians, openings of the kerb, parking and lanes."""
 
 from __future__ import annotations
 
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection, Use
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.kerbside import build_lay_bys, build_openings
@@ -16,8 +16,6 @@ from predmapnet.demo_world.town.medians import median_islands
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.town.street_plan import Rank, StreetPlan
 from predmapnet.demo_world.town.works import Stretch, Works, spaced
-
-Float = NDArray[np.float64]
 
 
 def furnish(
@@ -58,7 +56,7 @@ def furnish(
 
 
 def _parking_places(line: ReferenceLine, section: CrossSection, stations: Float) -> list[Polygon]:
-    """Where cars are parked, in pieces short enough to be straight."""
+    """Parking areas, in pieces short enough to be straight."""
     edges = section.edges(stations)
     found = []
     for row, strip in enumerate(section.strips):

@@ -1,4 +1,4 @@
-"""What all streets of one town have in common."""
+"""Habits of a town, which all of its streets have in common."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from predmapnet.demo_world.world import CrossingStyle
 
 @dataclass(frozen=True)
 class Habits:
-    """How a town builds and paints its streets.
+    """Habits of a town in building and painting its streets.
 
     Attributes:
         left_hand: traffic keeps to the left.

@@ -1,4 +1,4 @@
-"""Where streets meet: the paved outline, the curve of each corner, and how far a junction reaches along its arms."""
+"""Junctions: the paved outline, the curve of each corner, and how far a junction reaches along its arms."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import CrossSection
 from predmapnet.demo_world.town.street_plan import Arm, Rank, StreetPlan
-
-Float = NDArray[np.float64]
 
 LOCAL_REACH = 65.0
 """How far along its arms a junction is looked at, metres."""
@@ -24,7 +22,7 @@ FLAT = np.radians(152.0)
 
 @dataclass
 class ArmReach:
-    """How far a junction reaches along one arm; distances from the node, metres.
+    """Reach of a junction along one arm; distances from the node, metres.
 
     Attributes:
         arm: which.
@@ -39,16 +37,15 @@ class ArmReach:
     stop: float = 0.0
     paint: float = 0.0
 
+    @property
+    def clear(self) -> float:
+        """Where the kerbs of both sides have left the corners."""
+        return max(self.left_clear, self.right_clear)
+
 
 @dataclass
 class Corner:
-    """The kerb between an arm and the next one anticlockwise.
-
-    Attributes:
-        gap: angle between the two arms, radians.
-        radius: of the kerb, metres.
-        curve: ``(n, 2)`` from the first arm to the next, metres.
-    """
+    """The kerb between an arm and the next one anticlockwise, ``gap`` radians further: ``curve (n, 2)``, metres."""
 
     gap: float
     radius: float

@@ -7,17 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
 from predmapnet.demo_world.town.cross_sections import CrossSection, Use
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 
-Float = NDArray[np.float64]
-
 
 class Kerbside(NamedTuple):
-    """What lies along one kerb: pieces of paved ground to be added, and places where cars are parked."""
+    """Ground along one kerb: pieces of pavement to be added, and places where cars are parked."""
 
     paved: list[Polygon]
     parking: list[Polygon]
@@ -32,17 +29,10 @@ def build_openings(
     rate: float,
     taken: shapely.Geometry,
 ) -> list[Polygon]:
-    """Driveways, and entrances of yards with the yards, along both kerbs between two stations.
+    """Return driveways, and entrances of yards with the yards, along both kerbs between two stations of a street.
 
-    Args:
-        random: draws them.
-        line, section: of the street.
-        start, end: stations, metres.
-        rate: openings per metre of kerb.
-        taken: prepared geometry that they keep clear of (other streets).
-
-    Returns:
-        Paved pieces that overlap the street a little.
+    They are paved pieces that overlap the street a little, ``rate`` openings per metre of kerb, and keep clear of the
+    prepared geometry ``taken`` (other streets).
     """
     found: list[Polygon] = []
     for side in (1, -1):

@@ -1,4 +1,4 @@
-"""Where cars can drive: the lanes of each stretch of street, by direction."""
+"""Lane graph: the lanes of each stretch of street, by direction."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import DRIVEN, CrossSection
 from predmapnet.demo_world.town.reference_line import ReferenceLine
-
-Float = NDArray[np.float64]
 
 WIDE_ENOUGH = 2.0
 """A lane is open where it is at least this wide, metres."""
@@ -45,7 +44,7 @@ def lanes_between(
     stop: float,
     main: bool,
 ) -> Carriageway | None:
-    """The carriageway of one direction.
+    """Return the carriageway of one direction, +1 along the stations; None where no lane goes that way.
 
     Args:
         line, section: of the street.
@@ -54,9 +53,6 @@ def lanes_between(
         nodes: at the start and the end of the stretch, along the stations.
         stop: metres before the end in driving direction.
         main: whether the street is more than an alley.
-
-    Returns:
-        None where no lane goes that way.
     """
     edges = section.edges(stations)
     lines, begins, ends = [], [], []

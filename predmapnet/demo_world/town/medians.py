@@ -1,4 +1,4 @@
-"""What lies between the directions: raised medians as islands, and painted gaps as hatched areas."""
+"""Medians between the directions: raised ones as islands, and painted gaps as hatched areas."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from predmapnet.demo_world.town.cross_sections import CrossSection, Use
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.world import Hatching
-
-Float = NDArray[np.float64]
 
 
 def _wide_runs(wide: NDArray[np.bool_]) -> list[slice]:

@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.street_plan import TOWN_CENTRE
 from predmapnet.demo_world.world import VectorMap
-
-Float = NDArray[np.float64]
 
 
 def mirrored(points: Float) -> Float:

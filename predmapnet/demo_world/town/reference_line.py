@@ -8,10 +8,9 @@ from functools import cached_property
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely import Polygon
 
-Float = NDArray[np.float64]
+from mapfusion.arrays import Float
 
 STEP = 2.0
 """Distance between the samples of a reference line, metres."""
@@ -19,12 +18,9 @@ STEP = 2.0
 
 @dataclass(frozen=True)
 class ReferenceLine:
-    """A smooth line sampled by arc length. Stations are metres along it, lateral offsets metres to its left.
+    """A smooth line sampled by arc length: points and unit tangents ``(n, 2)`` at stations ``(n,)``.
 
-    Attributes:
-        stations: ``(n,) float64``.
-        points: ``(n, 2) float64``, metres.
-        tangents: ``(n, 2) float64``, unit length.
+    Stations are metres along it, lateral offsets metres to its left.
     """
 
     stations: Float
@@ -72,13 +68,9 @@ class ReferenceLine:
 
 
 def grow_line(start: Float, heading: float, length: float, curvature: Float) -> ReferenceLine:
-    """Grow a line from a place and a direction.
+    """Grow a line of that length from a place and a heading (radians), with curvatures ``(k,)`` per metre.
 
-    Args:
-        start: ``(2,)``, metres.
-        heading: radians.
-        length: metres.
-        curvature: ``(k,)`` values per metre at even spacing along the line, interpolated between.
+    Those lie at even spacing along the line and are interpolated between.
     """
     count = max(2, round(length / STEP) + 1)
     stations = np.linspace(0.0, length, count)

@@ -7,14 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.cross_sections import ACTIVE, PAIRED, CrossSection, Strip, Use
 from predmapnet.demo_world.town.habits import Habits
 from predmapnet.demo_world.town.reference_line import ReferenceLine
 from predmapnet.demo_world.world import Divider, LineStyle
-
-Float = NDArray[np.float64]
 
 SPACING = 1.0
 """Between the places of a street that are looked at, metres."""
@@ -24,7 +22,7 @@ SHORTEST = 3.0
 
 
 class _Line(NamedTuple):
-    """What one place of a line is: a divider or only paint, and how it looks."""
+    """One place of a line: a divider or only paint, and its looks."""
 
     is_divider: bool
     style: LineStyle
@@ -45,21 +43,12 @@ def paint_street(
     stops: tuple[float, float],
     habits: Habits,
 ) -> tuple[list[Divider], list[Divider]]:
-    """Draw the lines of a street between two stations.
+    """Draw the lines of a street between two stations: dividers, and lines that are no dividers.
 
     A line between two lanes that touch is a divider, however it is painted. What only borders a painted gap, a
     median, parking or the kerb is paint and no more, as in the official truth of Argoverse 2, where a line counts
-    when both lanes beside it know each other.
-
-    Args:
-        random: decides where single lines end.
-        line, section: of the street.
-        start, end: stations, metres.
-        stops: stations at which traffic stops at the start and at the end (-inf or inf: it does not).
-        habits: of the town.
-
-    Returns:
-        Dividers, and lines that are no dividers.
+    when both lanes beside it know each other. ``stops`` are the stations at which traffic stops at the start and at the
+    end (-inf or inf: it does not).
     """
     stations = np.linspace(start, end, max(2, round((end - start) / SPACING) + 1))
     runs = _lines_between_strips(section, stations, stops, habits)
@@ -91,9 +80,9 @@ def _lines_between_strips(section: CrossSection, stations: Float, stops: tuple[f
             kind = _kind(section, strips[upper], strips[lower], station, stops, habits)
             if kind is None:
                 continue
-            kinds, offsets = runs.setdefault(
-                _key(section, upper, lower), ([None] * len(stations), np.zeros(len(stations)))
-            )
+            # Lines keep their name along the street: the lane on the outer side of them, or the middle's left edge.
+            name = upper if upper < len(section.left) else 100 + lower
+            kinds, offsets = runs.setdefault(name, ([None] * len(stations), np.zeros(len(stations))))
             kinds[column], offsets[column] = kind, (edges[upper + 1, column] + edges[lower, column]) / 2
     return runs
 
@@ -107,11 +96,6 @@ def _edge_lines(section: CrossSection, stations: Float, habits: Habits) -> _Runs
             colour = habits.centre_colour if section.one_way and row == 0 else "white"
             runs[key] = [_Line(False, LineStyle.SOLID, colour, False)] * len(stations), edges[row] + sign * 0.35
     return runs
-
-
-def _key(section: CrossSection, upper: int, lower: int) -> int:
-    """Lines keep their name along the street: by the lane on the outer side of them, or the middle's left edge."""
-    return upper if upper < len(section.left) else 100 + lower
 
 
 def _stretches(kinds: list[_Line | None]) -> list[tuple[int, int]]:
@@ -130,7 +114,7 @@ def _stretches(kinds: list[_Line | None]) -> list[tuple[int, int]]:
 
 
 def _changes(kinds: list[_Line | None], stations: Float) -> tuple[tuple[float, LineStyle], ...]:
-    """Where along a line another style of paint begins, metres from its start."""
+    """Changes of the style of paint along a line, metres from its start."""
     found = []
     for index in range(1, len(kinds)):
         before, this = kinds[index - 1], kinds[index]
@@ -142,7 +126,7 @@ def _changes(kinds: list[_Line | None], stations: Float) -> tuple[tuple[float, L
 def _kind(
     section: CrossSection, left: Strip, right: Strip, station: float, stops: tuple[float, float], habits: Habits
 ) -> _Line | None:
-    """What lies between two neighbouring strips at a station, the left one as seen along the stations."""
+    """The line between two neighbouring strips at a station, the left one as seen along the stations."""
     pair = {left.use, right.use}
     if left.use in PAIRED and right.use in PAIRED:
         if Use.TURNS in pair:

@@ -10,6 +10,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import arc_length
 from predmapnet.demo_world.town.driving import (
     FRONT_OVERHANG,
@@ -23,8 +24,6 @@ from predmapnet.demo_world.town.lane_graph import Carriageway
 from predmapnet.demo_world.town.mirror import mirrored
 from predmapnet.demo_world.town.town import Town
 from predmapnet.demo_world.world import Trajectory
-
-Float = NDArray[np.float64]
 
 SHORTEST_DRIVE = 60.0
 """Metres that the car covers in every scene."""
@@ -47,17 +46,9 @@ class NoDriveError(Exception):
 
 
 def drive(town: Town, seed: int) -> Trajectory:
-    """Drive through a town for 20 s and note the pose twice a second.
+    """Drive through a town for 20 s: 40 key frames, 0.5 s apart, with a small pitch and roll.
 
-    Args:
-        town: where.
-        seed: the same seed gives the same drive.
-
-    Returns:
-        40 key frames, 0.5 s apart, with a small pitch and roll.
-
-    Raises:
-        NoDriveError: no street is long enough, or traffic stops the car too early.
+    Raises NoDriveError where no street is long enough, or traffic stops the car too early.
     """
     random = np.random.default_rng([0x726F757465, seed])
     path, stops = _draw_path(random, town)
@@ -70,13 +61,10 @@ def drive(town: Town, seed: int) -> Trajectory:
 
 
 def _draw_path(random: Generator, town: Town) -> tuple[Float, Float]:
-    """Draw a walk through the town that is long enough and stays on the road, and the path of the rear axle.
+    """Draw a walk through the town that is long enough and stays on the road.
 
-    Returns:
-        The path ``(n, 2)`` at even steps, and the distances along it at which a car may have to stop.
-
-    Raises:
-        NoDriveError: the town has no such walk.
+    Returns the path ``(n, 2)`` of the rear axle at even steps, and the distances along it at which a car may have to
+    stop; raises NoDriveError if the town has no such walk.
     """
     road = town.surface.buffer(0.05)
     shapely.prepare(road)

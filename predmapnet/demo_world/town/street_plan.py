@@ -8,11 +8,9 @@ from enum import StrEnum
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.reference_line import ReferenceLine, draw_curvature, grow_line, reverse_and_join
-
-Float = NDArray[np.float64]
 
 TOWN_CENTRE = np.array([400.0, 400.0])
 """Where every town lies in the global frame, metres: all coordinates stay positive."""
@@ -25,7 +23,7 @@ SMALLEST_ANGLE = np.radians(34.0)
 
 
 class Rank(StrEnum):
-    """How important a street is."""
+    """Importance of a street."""
 
     ARTERIAL = "arterial"
     COLLECTOR = "collector"
@@ -37,10 +35,7 @@ class Rank(StrEnum):
 class Street:
     """A street while and after it is planned.
 
-    Attributes:
-        line: its reference line.
-        rank: how important it is.
-        stops: (station, node) in order of station; node -1 where the street leaves the town.
+    ``stops`` are its (station, node) in order of station; node -1 where the street leaves the town.
     """
 
     line: ReferenceLine

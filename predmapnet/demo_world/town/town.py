@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from numpy.random import Generator
-from numpy.typing import NDArray
 
 from predmapnet.demo_world.town.assembly import assemble
 from predmapnet.demo_world.town.bays import shape_street
@@ -24,8 +23,6 @@ from predmapnet.demo_world.town.road_paint import paint_street
 from predmapnet.demo_world.town.street_plan import Rank, Street, StreetPlan, plan_streets
 from predmapnet.demo_world.town.works import Stretch, Works, spaced
 from predmapnet.demo_world.world import LineStyle, VectorMap
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ def _cross_junction(
         room = abs(arm.far - arm.station)
         if len(junction.reaches) == 1 or (junction.is_minor and not is_alley):
             continue
-        reach.stop = max(reach.left_clear, reach.right_clear) + float(random.uniform(-1.0, 1.5))
+        reach.stop = reach.clear + float(random.uniform(-1.0, 1.5))
         crossing = crossings.get(index)
         if crossing is not None:
             works.crossings.append(crossing)

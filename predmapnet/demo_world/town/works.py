@@ -1,4 +1,4 @@
-"""What is built of a town stretch by stretch, before it is assembled into a map."""
+"""Works: the parts of a town, built stretch by stretch before they are assembled into a map."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely import Polygon
 
+from mapfusion.arrays import Float
 from predmapnet.demo_world.town.junctions import ArmReach
 from predmapnet.demo_world.town.lane_graph import Carriageway
 from predmapnet.demo_world.world import Crossing, Divider, Hatching
-
-Float = NDArray[np.float64]
 
 
 @dataclass
@@ -45,15 +43,8 @@ class Stretch:
 
     def inner(self, of: str) -> tuple[float, float]:
         """Stations between the junctions, by ``clear``, ``stop`` or ``paint``."""
-        first, last = self.reaches
-        values = [0.0 if reach is None else _distance(reach, of) for reach in (first, last)]
-        return self.start + values[0], self.end - values[1]
-
-
-def _distance(reach: ArmReach, of: str) -> float:
-    if of == "clear":
-        return max(reach.left_clear, reach.right_clear)
-    return reach.stop if of == "stop" else reach.paint
+        first, last = (0.0 if reach is None else float(getattr(reach, of)) for reach in self.reaches)
+        return self.start + first, self.end - last
 
 
 def spaced(start: float, end: float, spacing: float = 2.0) -> Float:

@@ -14,14 +14,12 @@ from torch import Tensor
 from predmapnet.network.kernels.tracing import is_traced
 
 
-def bilinear_corners(x: Tensor, y: Tensor, width: Tensor | int, height: Tensor | int) -> tuple[Tensor, Tensor]:
-    """Find the four pixels around each position, and their shares.
+def bilinear_corners(x: Tensor, y: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Find the four pixels of a map around each position, and their shares.
 
     Args:
-        x: ``(...)``, in pixels; 0 is the centre of the first pixel.
-        y: ``(...)``.
-        width: of the map; a tensor that broadcasts against ``x`` where there are several maps.
-        height: of the map.
+        x, y: ``(...)``, in pixels; 0 is the centre of the first pixel.
+        width, height: of the map, pixels.
 
     Returns:
         Flat indices ``(..., 4) int32`` into the map, row by row, and weights ``(..., 4)``; pixels outside the map
@@ -29,33 +27,25 @@ def bilinear_corners(x: Tensor, y: Tensor, width: Tensor | int, height: Tensor |
     """
     columns, column_weights = _neighbours(x, width)
     rows, row_weights = _neighbours(y, height)
-    stride = width[..., None, None] if isinstance(width, Tensor) else width
-    indices = rows[..., :, None] * stride + columns[..., None, :]
+    indices = rows[..., :, None] * width + columns[..., None, :]
     weights = row_weights[..., :, None] * column_weights[..., None, :]
     return indices.flatten(-2), weights.flatten(-2)
 
 
-def _neighbours(position: Tensor, size: Tensor | int) -> tuple[Tensor, Tensor]:
+def _neighbours(position: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Return the two neighbours ``(..., 2) int32`` of each position on a line of pixels, and their shares."""
     first = position.floor()
     fraction = position - first
     both = torch.stack([first, first + 1], dim=-1)
-    last = size[..., None] - 1 if isinstance(size, Tensor) else torch.full_like(both[..., :1], size - 1)
-    clamped = both.clamp(min=0).minimum(last)
+    clamped = both.clamp(0, size - 1)
     shares = torch.stack([1 - fraction, fraction], dim=-1)
     return clamped.int(), shares * (both == clamped)
 
 
 def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:
-    """Add up rows of a table, in the precision of the weights.
+    """Add up rows ``indices (results, n)`` of a table ``(rows, C)``, in the precision of their weights.
 
-    Args:
-        table: ``(rows, C)``.
-        indices: ``(results, n) int``, n a multiple of 4: the corners of each sample.
-        weights: ``(results, n)``.
-
-    Returns:
-        ``(results, C)``.
+    n is a multiple of 4: the corners of each sample.
     """
     if is_traced():  # ONNX has no bags. The corners of a sample one after the other need a quarter of the memory.
         corners = zip(

@@ -14,8 +14,7 @@ from predmapnet.network.predmapnet import PredMapNet
 def compile_features(network: PredMapNet) -> None:
     """Let the image backbone and the BEV encoder be compiled in the first frame; the network is changed in place.
 
-    Raises:
-        UserError: there is no compiler for the network's device.
+    Raises UserError where there is no compiler for the network's device.
     """
     if network.device.type == "cuda":
         if not has_triton():

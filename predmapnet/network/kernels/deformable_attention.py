@@ -6,9 +6,26 @@ from collections.abc import Sequence
 from itertools import accumulate
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from predmapnet.network.kernels.bilinear_sampling import bilinear_corners, weighted_rows
+from predmapnet.network.kernels.matrix_product import Linear
+
+
+class DeformableAttention(nn.Module):
+    """Base of the deformable attentions: every head takes so many samples of the values around a reference.
+
+    Queries are as wide as the values, or ``query_width``.
+    """
+
+    def __init__(self, width: int, heads: int, samples: int, dropout: float, query_width: int | None = None) -> None:
+        super().__init__()
+        self.heads = heads
+        self.sampling_offsets = Linear(query_width or width, 2 * heads * samples)
+        self.attention_weights = Linear(query_width or width, heads * samples)
+        self.value = Linear(width, width)
+        self.output = Linear(width, width)
+        self.dropout = nn.Dropout(dropout)
 
 
 def deformable_attention(
@@ -19,18 +36,14 @@ def deformable_attention(
     weights: Tensor,
     level_sizes: Sequence[tuple[int, int]],
 ) -> Tensor:
-    """Sum up weighted samples of feature maps.
+    """Sum up weighted samples of feature maps: ``(R, heads * D)``.
 
     Args:
         values: ``(rows, heads, D)``: the pixels of all maps, level by level and row by row.
         first_row: ``(R) int32``, where in ``values`` the maps of each query begin.
-        x: ``(R, heads, L, S)``, positions in pixels of the level; 0 is the centre of the first pixel.
-        y: likewise.
+        x, y: ``(R, heads, L, S)``, positions in pixels of the level; 0 is the centre of the first pixel.
         weights: likewise.
         level_sizes: rows and columns of each level.
-
-    Returns:
-        ``(R, heads * D)``.
     """
     queries, heads = x.shape[:2]
     corners = [

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from predmapnet.machine import Precision
 from predmapnet.network.calibration import Calibration
+from predmapnet.network.kernels.deformable_attention import DeformableAttention
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
-from predmapnet.network.maptracker.bevformer import BevFormer, BevSelfAttention, ImageCrossAttention
+from predmapnet.network.maptracker.bevformer import BevFormer
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.small.bev_encoder import BevEncoder
 from predmapnet.network.state import ViewGeometry
@@ -22,9 +23,7 @@ from predmapnet.network.state import ViewGeometry
 def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:
     """Return the network with its image backbone and BEV encoder in a precision; it is changed in place.
 
-    Args:
-        network: made for inference (:func:`predmapnet.network.kernels.inference.for_inference`).
-        precision: float32 changes nothing.
+    It has to be one made for inference (:func:`predmapnet.network.kernels.inference.for_inference`).
     """
     if precision is Precision.BFLOAT16:
         for name in ("image_backbone", "bev_encoder"):
@@ -59,6 +58,6 @@ def _decide_places(module: nn.Module) -> list[nn.Module]:
     """Return the layers that say where a module looks, and how much each place counts."""
     if isinstance(module, DeformableConvolution):
         return [module.offsets]
-    if isinstance(module, BevSelfAttention | ImageCrossAttention):
+    if isinstance(module, DeformableAttention):
         return [module.sampling_offsets, module.attention_weights]
     return []

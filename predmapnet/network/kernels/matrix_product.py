@@ -18,18 +18,10 @@ SMALLEST_BATCH = 16
 
 
 def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Compute what ``F.linear`` computes, in the precision of the weight.
+    """Multiply tokens ``(..., C_in)`` by a weight ``(C_out, C_in)`` and add the bias, in the precision of the weight.
 
     On a CPU, torch multiplies matrices by MKL, which runs at less than half the machine's rate unless Intel made it,
     and convolutions by oneDNN, which does not. So many rows are put as the pixels of a 1x1 convolution.
-
-    Args:
-        tokens: ``(..., C_in)``.
-        weight: ``(C_out, C_in)``.
-        bias: ``(C_out)``.
-
-    Returns:
-        ``(..., C_out)``.
     """
     tokens = tokens.to(weight.dtype)
     if is_traced():

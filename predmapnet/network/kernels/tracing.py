@@ -1,4 +1,4 @@
-"""Where a traced graph differs from eager code: shapes that depend on data become fixed, and nothing is skipped."""
+"""Differences of a traced graph from eager code: shapes that depend on data are fixed, and nothing is skipped."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.config import EncoderBevMemoryConfig, PredMapNetConfig
+from predmapnet.config import BevFormerConfig, EncoderBevMemoryConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_pose
 from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 from predmapnet.network.layers import cell_centres
@@ -18,12 +18,9 @@ from predmapnet.network.state import StreamState
 
 @dataclass
 class PastBevMaps:
-    """Chosen past maps, from far to near.
+    """Chosen past maps, from far to near: ``(B, S, C, H, W)``, and which ``slots`` of the memory they are.
 
-    Attributes:
-        maps: ``(B, S, C, H, W)`` in the current ego frame, zeros where they do not reach and in slots without a map.
-        slots: ``(B, S) int64``, which maps of the memory these are.
-        valid: ``(B, S) bool``.
+    They are in the current ego frame, zeros where they do not reach and in slots without a (valid) map.
     """
 
     maps: Tensor
@@ -42,14 +39,9 @@ class BevMemoryFusion(nn.Module):
         self.second = NormalisedConvolution(width, width, 3)
 
     def forward(self, history: Tensor, current: Tensor) -> Tensor:
-        """Fuse.
+        """Return what past maps ``(B, S, C, H, W)``, far to near, add to the current one ``(B, C, H, W)``.
 
-        Args:
-            history: ``(B, S, C, H, W)``, from far to near; fewer maps than slots count as zero maps in front.
-            current: ``(B, C, H, W)``.
-
-        Returns:
-            ``(B, C, H, W)``, to be added to ``current``.
+        Fewer maps than slots count as zero maps in front.
         """
         batch, maps, width = history.shape[:3]
         missing = current.new_zeros(batch, self.slots - maps, width, *current.shape[2:])
@@ -59,13 +51,7 @@ class BevMemoryFusion(nn.Module):
 
 
 def warp_past_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> PastBevMaps:
-    """Choose past maps and warp them.
-
-    Args:
-        state: of the last frame.
-        ego_to_global: ``(B, 4, 4) float64``, current.
-        config: distances, region and the quirk.
-    """
+    """Choose past maps of a state and warp them to the current pose ``(B, 4, 4) float64``."""
     slots, chosen = choose_maps(state, ego_to_global, config)
     stream = torch.arange(len(slots), device=slots.device)[:, None]
     current_to_past = relative_pose(ego_to_global[:, None], state.bev_memory_pose[stream, slots])
@@ -77,25 +63,13 @@ def warp_past_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNet
 
 
 def choose_maps(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> tuple[Tensor, Tensor]:
-    """Return which maps of the memory are looked at ``(B, S) int64``, from far to near, and which of these are there.
-
-    Args:
-        state: of the last frame.
-        ego_to_global: ``(B, 4, 4) float64``, current.
-        config: distances.
-    """
+    """Return which maps of the memory are looked at ``(B, S) int64``, from far to near, and which of them are there."""
     travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1)
-    return select_strided(travelled, state.bev_memory_valid, config.temporal_bev.distances, fallback="latest")
+    return select_strided(travelled, state.bev_memory_valid, config.bev.memory.distances, fallback="latest")
 
 
 def nearest_pose(state: StreamState, ego_to_global: Tensor, config: PredMapNetConfig) -> Tensor:
-    """Return the pose ``(B, 4, 4) float64`` of the nearest map that is looked at; of the last frame if there is none.
-
-    Args:
-        state: of the last frame.
-        ego_to_global: ``(B, 4, 4) float64``, current.
-        config: distances.
-    """
+    """Return the pose ``(B, 4, 4) float64`` of the nearest map that is looked at; without one, of the last frame."""
     if state.bev_memory.shape[1] == 0:
         return state.ego_to_global
     slots, _ = choose_maps(state, ego_to_global, config)
@@ -106,17 +80,7 @@ def nearest_pose(state: StreamState, ego_to_global: Tensor, config: PredMapNetCo
 def store_bev_map(
     state: StreamState, bev: Tensor, ego_to_global: Tensor, config: EncoderBevMemoryConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Store the current map; the oldest goes when the memory is full.
-
-    Args:
-        state: of the last frame.
-        bev: ``(B, C, H, W)``.
-        ego_to_global: ``(B, 4, 4) float64``.
-        config: the capacity.
-
-    Returns:
-        The new ``bev_memory``, ``bev_memory_pose`` and ``bev_memory_valid``.
-    """
+    """Return the BEV memory (maps, poses, validity) with the map ``(B, C, H, W)`` of this frame; the oldest may go."""
     known = state.bev_memory_valid.new_ones(len(bev), 1)
     kept = slice(-config.capacity, None)
     return (
@@ -127,14 +91,10 @@ def store_bev_map(
 
 
 def warp_grid(current_to_past: Tensor, config: PredMapNetConfig) -> Tensor:
-    """Find the cells of the current BEV grid in past maps.
+    """Find the cells of the current BEV grid in past maps, whose motion is ``(..., 4, 4) float64``.
 
     Rounded where the official code rounds: after :func:`predmapnet.network.ego_motion.warp_bev`, which does the same,
     the BEV features would differ by more than 2e-5 from the official ones.
-
-    Args:
-        current_to_past: ``(..., 4, 4) float64``.
-        config: size of the grid and the quirk.
 
     Returns:
         ``(..., H, W, 2) float32``, as ``grid_sample`` wants it: -1 and 1 are the borders of the map, y downwards.
@@ -150,9 +110,12 @@ def warp_grid(current_to_past: Tensor, config: PredMapNetConfig) -> Tensor:
 def _cells(config: PredMapNetConfig, device: torch.device) -> Tensor:
     """Return the positions ``(H, W, 2) float64`` that are looked up, metres in the current ego frame."""
     length, width = config.roi_length, config.roi_width
-    if config.quirks.endpoint_warp_grid:  # Released weights saw every past map zoomed by this, rounded to 32 bits.
-        x = torch.linspace(-length / 2, length / 2, config.bev.columns, dtype=torch.float32, device=device)
-        y = torch.linspace(width / 2, -width / 2, config.bev.rows, dtype=torch.float32, device=device)
+    bev = config.bev
+    if (
+        isinstance(bev, BevFormerConfig) and bev.quirks.endpoint_warp_grid
+    ):  # Released weights saw every past map zoomed by this, rounded to 32 bits.
+        x = torch.linspace(-length / 2, length / 2, bev.columns, dtype=torch.float32, device=device)
+        y = torch.linspace(width / 2, -width / 2, bev.rows, dtype=torch.float32, device=device)
         return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1).double()
-    x, y = (cell_centres(config.bev.rows, config.bev.columns, device).double() - 0.5).unbind(-1)
+    x, y = (cell_centres(bev.rows, bev.columns, device).double() - 0.5).unbind(-1)
     return torch.stack([x * length, y * width], dim=-1)

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PILLAR_SAMPLES, BevFormerConfig, PredMapNetConfig
+from predmapnet.config import BevFormerConfig, PredMapNetConfig
 from predmapnet.network.calibration import Calibration
-from predmapnet.network.kernels.deformable_attention import deformable_attention
-from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.kernels.deformable_attention import DeformableAttention, deformable_attention
 from predmapnet.network.layers import ResidualPerceptron, flatten_cells
 from predmapnet.network.maptracker.bev_memory import BevMemoryFusion, warp_past_maps
 from predmapnet.network.maptracker.reference_points import (
@@ -29,7 +28,7 @@ LEVEL_CODES = 4
 """One more than there are levels: released weights hold a fourth that is never used."""
 
 
-class BevSelfAttention(nn.Module):
+class BevSelfAttention(DeformableAttention):
     """Deformable attention of the ground cells to each other.
 
     BEVFormer's temporal self-attention, of which MapTracker uses half: its queue of two maps holds the current map
@@ -40,27 +39,12 @@ class BevSelfAttention(nn.Module):
     POINTS = 4
 
     def __init__(self, config: BevFormerConfig, mirrored: bool) -> None:
-        super().__init__()
-        width, self.heads = config.width, config.heads
+        super().__init__(config.width, config.heads, self.QUEUE * self.POINTS, config.dropout, 2 * config.width)
         self.grid = (config.rows, config.columns)
         self.mirrored = mirrored
-        samples = self.heads * self.QUEUE * self.POINTS
-        self.sampling_offsets = Linear(2 * width, 2 * samples)
-        self.attention_weights = Linear(2 * width, samples)
-        self.value = Linear(width, width)
-        self.output = Linear(width, width)
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, cells: Tensor, code: Tensor) -> Tensor:
-        """Attend.
-
-        Args:
-            cells: ``(B, H * W, C)``.
-            code: ``(H * W, C)``, position code of the cells.
-
-        Returns:
-            ``(B, H * W, C)``, the input included.
-        """
+        """Attend among cells ``(B, H * W, C)`` with their position code ``(H * W, C)``; the input is included."""
         batch, count, _ = cells.shape
         both = torch.cat([cells, cells + code], dim=-1).flatten(0, 1)
         values = self.value(cells).view(batch * count, self.heads, -1)
@@ -70,7 +54,7 @@ class BevSelfAttention(nn.Module):
         row, column = self._references(cells.device)
         x = offsets[..., 0].unflatten(0, (batch, count)) + column[:, None, None, None]
         y = offsets[..., 1].unflatten(0, (batch, count)) + row[:, None, None, None]
-        first_row = _stream_rows(batch, count, count, cells.device)
+        first_row = (torch.arange(batch, device=cells.device, dtype=torch.int32) * count).repeat_interleave(count)
         attended = deformable_attention(values, first_row, x.flatten(0, 1), y.flatten(0, 1), weights, [self.grid])
         return cells + self.dropout(self.output(attended.view(batch, count, -1)))
 
@@ -83,32 +67,25 @@ class BevSelfAttention(nn.Module):
         return row.repeat_interleave(columns), torch.arange(columns, device=device).repeat(rows)
 
 
-class ImageCrossAttention(nn.Module):
+class ImageCrossAttention(DeformableAttention):
     """Deformable attention of the ground cells to the images in which they are seen (spatial cross-attention)."""
 
-    POINTS = PILLAR_SAMPLES
+    POINTS = 8
+    """Samples of each head per camera and level; they take the heights of a pillar in turns."""
 
     def __init__(self, config: BevFormerConfig) -> None:
-        super().__init__()
-        width, self.heads = config.width, config.heads
-        samples = self.heads * IMAGE_LEVELS * self.POINTS
-        self.sampling_offsets = Linear(width, 2 * samples)
-        self.attention_weights = Linear(width, samples)
-        self.value = Linear(width, width)
-        self.output = Linear(width, width)
-        self.dropout = nn.Dropout(config.dropout)
+        super().__init__(config.width, config.heads, IMAGE_LEVELS * self.POINTS, config.dropout)
 
     def forward(self, cells: Tensor, tokens: Tensor, references: ReferencePoints, camera_valid: Tensor) -> Tensor:
-        """Attend: the mean over the cameras that see a cell and are valid.
+        """Attend from cells ``(B, H * W, C)`` to tokens; the input is included.
+
+        A cell takes the mean over the cameras that see it and are valid.
 
         Args:
-            cells: ``(B, H * W, C)``.
+            cells: of the ground.
             tokens: ``(B, N, pixels of all levels, C)``.
             references: of the calibration of these frames.
             camera_valid: ``(B, N) bool``.
-
-        Returns:
-            ``(B, H * W, C)``, the input included.
         """
         valid = camera_valid.to(cells.dtype)
         cameras = (references.visible & camera_valid[:, :, None]).sum(dim=1).clamp(min=1)
@@ -168,13 +145,13 @@ class BevFormer(nn.Module):
         bev = config.bev
         assert isinstance(bev, BevFormerConfig)
         width, self.grid = bev.width, (bev.rows, bev.columns)
-        self.where_sum_is_positive = config.quirks.propagate_where_sum_is_positive
+        self.where_sum_is_positive = bev.quirks.propagate_where_sum_is_positive
         self.queries = nn.Parameter(torch.randn(bev.rows * bev.columns, width))
         self.row_code = nn.Parameter(torch.rand(bev.rows, width // 2))
         self.column_code = nn.Parameter(torch.rand(bev.columns, width // 2))
         self.level_code = nn.Parameter(torch.randn(LEVEL_CODES, width))
         self.camera_code = nn.Parameter(torch.randn(len(bev.cameras), width))
-        past_maps, mirrored = len(config.temporal_bev.distances), config.quirks.mirrored_self_attention
+        past_maps, mirrored = len(bev.memory.distances), bev.quirks.mirrored_self_attention
         self.layers = nn.ModuleList(BevEncoderLayer(bev, past_maps, mirrored) for _ in range(bev.layers))
         self.register_buffer("pillars", pillar_points(bev, config.roi), persistent=False)
         self.pillars: Tensor
@@ -186,13 +163,7 @@ class BevFormer(nn.Module):
     def forward(
         self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState
     ) -> list[Tensor]:
-        """Encode.
-
-        Args:
-            levels: image features ``(B, N, C, h_i, w_i)``, fine to coarse.
-            inputs: which cameras count, and poses.
-            geometry: of :meth:`geometry`.
-            state: of the last frame; its maps take part.
+        """Turn image features ``(B, N, C, h_i, w_i)``, fine to coarse, and the state's past maps into BEV features.
 
         Returns:
             A single level ``(B, C, H, W)``, channels-last in memory.
@@ -229,11 +200,6 @@ class BevFormer(nn.Module):
             for features, code in zip(levels, self.level_code[: len(levels)], strict=True)
         ]
         return torch.cat(tokens, dim=2)
-
-
-def _stream_rows(batch: int, queries: int, rows: int, device: torch.device) -> Tensor:
-    """Return ``(batch * queries) int32``: where the table of each query's stream begins."""
-    return (torch.arange(batch, device=device, dtype=torch.int32) * rows).repeat_interleave(queries)
 
 
 def _as_map(cells: Tensor, grid: Sequence[int]) -> Tensor:

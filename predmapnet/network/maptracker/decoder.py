@@ -8,37 +8,23 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
-from predmapnet.network.kernels.deformable_attention import deformable_attention
-from predmapnet.network.kernels.matrix_product import Linear
-from predmapnet.network.layers import ResidualPerceptron
+from predmapnet.network.kernels.deformable_attention import DeformableAttention, deformable_attention
+from predmapnet.network.layers import ResidualPerceptron, flatten_cells, interleaved_sines
 from predmapnet.network.map_decoder import DecoderInput, MapDecoder
 from predmapnet.network.maptracker.vector_memory import RecalledQueries
 
 
-class LineCrossAttention(nn.Module):
+class LineCrossAttention(DeformableAttention):
     """Deformable attention of rows to the BEV map: every head looks around each point of the row's line once."""
 
     def __init__(self, config: MapTrackerDecoderConfig, grid: tuple[int, int]) -> None:
-        super().__init__()
-        width, self.heads = config.width, config.heads
+        super().__init__(config.width, config.heads, config.points, config.dropout)
         self.grid = grid
-        samples = self.heads * config.points
-        self.sampling_offsets = nn.Linear(width, 2 * samples)
-        self.attention_weights = nn.Linear(width, samples)
-        self.value = Linear(width, width)
-        self.output = nn.Linear(width, width)
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, rows: Tensor, points: Tensor, cells: Tensor) -> Tensor:
-        """Attend.
+        """Attend from rows ``(B, R, C)`` around their points ``(B, R, P, 2)``, normalised, to cells ``(B, H * W, C)``.
 
-        Args:
-            rows: ``(B, R, C)``.
-            points: ``(B, R, P, 2)``, normalised.
-            cells: ``(B, H * W, C)``.
-
-        Returns:
-            ``(B, R, C)``, the input included.
+        The input is included.
         """
         batch, count, width = rows.shape
         height, length = self.grid
@@ -59,13 +45,17 @@ class LineCrossAttention(nn.Module):
         return rows + self.dropout(self.output(attended.view(batch, count, width)))
 
 
-class MemoryAttention(nn.Module):
-    """Attention of each track to its own recalled queries."""
+class _RowAttention(nn.Module):
+    """Base of the attentions whose queries are rows."""
 
     def __init__(self, config: MapTrackerDecoderConfig) -> None:
         super().__init__()
-        self.attention = _multihead(config)
+        self.attention = nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)
         self.dropout = nn.Dropout(config.dropout)
+
+
+class MemoryAttention(_RowAttention):
+    """Attention of each track to its own recalled queries."""
 
     def forward(self, tracks: Tensor, memory: RecalledQueries) -> Tensor:
         """Map tracks ``(B, T, C)`` to ``(B, T, C)``, the input included."""
@@ -77,13 +67,8 @@ class MemoryAttention(nn.Module):
         return tracks + self.dropout(attended.view_as(tracks))
 
 
-class RowSelfAttention(nn.Module):
+class RowSelfAttention(_RowAttention):
     """Attention of all rows to each other."""
-
-    def __init__(self, config: MapTrackerDecoderConfig) -> None:
-        super().__init__()
-        self.attention = _multihead(config)
-        self.dropout = nn.Dropout(config.dropout)
 
     def forward(self, rows: Tensor, valid: Tensor) -> Tensor:
         """Map rows ``(B, R, C)`` to ``(B, R, C)``, the input included; rows that are not valid are not looked at."""
@@ -104,10 +89,10 @@ class MapTrackerDecoderLayer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(config.width) for _ in range(4))
 
     def forward(self, rows: Tensor, points: Tensor, start: DecoderInput, cells: Tensor) -> Tensor:
-        """Refine.
+        """Refine rows ``(B, T + Q, C)``.
 
         Args:
-            rows: ``(B, T + Q, C)``.
+            rows: tracks, then detections.
             points: ``(B, T + Q, P, 2)``, where they are thought to be, normalised.
             start: validity, memory and age of the streams.
             cells: ``(B, H * W, C)`` of the BEV map.
@@ -139,7 +124,7 @@ class MapTrackerDecoder(MapDecoder):
         super().__init__()
         decoder, self.grid = config.decoder, (config.bev.rows, config.bev.columns)
         assert isinstance(decoder, MapTrackerDecoderConfig)
-        width, norm_before = decoder.width, config.quirks.norm_before_cross_attention
+        width, norm_before = decoder.width, decoder.quirks.norm_before_cross_attention
         self.input = nn.Conv2d(config.bev.widths[0], width, 1)
         self.layers = nn.ModuleList(
             MapTrackerDecoderLayer(decoder, self.grid, norm_before) for _ in range(decoder.layers)
@@ -173,23 +158,17 @@ class MapTrackerDecoder(MapDecoder):
     def bev_cells(self, bev: Tensor) -> Tensor:
         """Project the map and add a sine code of the position: ``(B, H * W, C)``."""
         projected = self.input(bev)
-        return (projected + position_code(projected.shape[1], self.grid, projected.device)).flatten(2).transpose(1, 2)
+        return flatten_cells(projected + position_code(projected.shape[1], self.grid, projected.device))
 
 
 def position_code(channels: int, grid: tuple[int, int], device: torch.device) -> Tensor:
     """Return DETR's sine code ``(C, H, W)`` of the cells: the first half tells the row, the second the column."""
     (rows, columns), half = grid, channels // 2
-    period = 10000.0 ** (torch.arange(half // 2, device=device, dtype=torch.float32) * 2 / half)
 
     def along(count: int) -> Tensor:
         place = torch.arange(1, count + 1, device=device, dtype=torch.float32) / (count + 1e-6) * (2 * math.pi)
-        angles = place[:, None] / period
-        return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1).T
+        return interleaved_sines(place, half).T
 
     row = along(rows)[:, :, None].expand(-1, -1, columns)
     column = along(columns)[:, None].expand(-1, rows, -1)
     return torch.cat([row, column])
-
-
-def _multihead(config: MapTrackerDecoderConfig) -> nn.MultiheadAttention:
-    return nn.MultiheadAttention(config.width, config.heads, dropout=config.dropout, batch_first=True)

@@ -66,12 +66,7 @@ def find_references(ego_to_image: Tensor, image_size: tuple[int, int], pillars: 
 
 
 def project_pillars(ego_to_image: Tensor, image_size: tuple[int, int], pillars: Tensor) -> tuple[Tensor, Tensor]:
-    """Project every point of every pillar.
-
-    Args:
-        ego_to_image: ``(M, 3, 4) float64``, of ``M`` cameras.
-        image_size: rows and columns of the network's input.
-        pillars: ``(cells, Z, 4) float32`` of :func:`pillar_points`.
+    """Project every point of pillars ``(cells, Z, 4) float32`` by ``(M, 3, 4) float64``, of ``M`` cameras.
 
     Returns:
         Positions ``(M, cells, Z, 2) float32`` in the images, 0 to 1 where inside, and which points are inside, as

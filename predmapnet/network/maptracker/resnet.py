@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from predmapnet.config import ResNet50Config
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 
@@ -104,10 +103,10 @@ class FeaturePyramid(nn.Module):
 class ResNet50Pyramid(nn.Module):
     """ResNet-50 and a feature pyramid over its levels."""
 
-    def __init__(self, config: ResNet50Config) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         self.resnet = ResNet50()
-        self.pyramid = FeaturePyramid(LEVEL_WIDTHS, config.channels)
+        self.pyramid = FeaturePyramid(LEVEL_WIDTHS, channels)
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Map ``(M, 3, h, w)`` to ``(M, channels, h / s, w / s)`` for the strides s = 8, 16 and 32."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ from torch import Tensor
 from predmapnet.config import MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_pose
 from predmapnet.network.kernels.tracing import stable_order
+from predmapnet.network.layers import interleaved_sines
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
 from predmapnet.network.maptracker.strided_selection import select_strided
 from predmapnet.network.state import VectorMemory
@@ -39,8 +39,10 @@ class RecalledQueries:
 def empty_vector_memory(batch: int, config: PredMapNetConfig, device: torch.device) -> VectorMemory:
     """Return a memory without tracks, and without any entry for a decoder that does not read it."""
     decoder = config.decoder
-    shape = (batch, 0, decoder.memory_capacity if isinstance(decoder, MapTrackerDecoderConfig) else 0)
-    precision = torch.float32 if config.quirks.single_precision_memory_poses else torch.float64
+    shape, precision = (batch, 0, 0), torch.float64
+    if isinstance(decoder, MapTrackerDecoderConfig):
+        shape = (batch, 0, decoder.memory_capacity)
+        precision = torch.float32 if decoder.quirks.single_precision_memory_poses else torch.float64
     return VectorMemory(
         queries=torch.zeros(*shape, decoder.width, device=device),
         poses=torch.zeros(*shape, 4, 4, dtype=precision, device=device),
@@ -73,15 +75,8 @@ def recall_queries(
     queries = memory.queries.take_along_dim(slots[..., None], dim=2).masked_fill(~valid[..., None], 0.0)
     carried = motion(queries, pose.to(queries.dtype)).masked_fill(~valid[..., None], 0.0).detach()
     age = frame[:, None, None] - memory.frames.gather(-1, slots)
-    code = age_code(age.masked_fill(~valid, 0), queries.shape[-1]).masked_fill(~valid[..., None], 0.0)
+    code = interleaved_sines(age.masked_fill(~valid, 0), queries.shape[-1]).masked_fill(~valid[..., None], 0.0)
     return RecalledQueries(carried, code, valid, slots, pose)
-
-
-def age_code(age: Tensor, width: int) -> Tensor:
-    """Return ``(..., width)``: sines and cosines, interleaved, of ages ``(...)`` in frames."""
-    steps = torch.arange(0, width, 2, device=age.device, dtype=torch.float32)
-    angles = age[..., None] * torch.exp(steps * (-math.log(10000.0) / width))
-    return torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(-2)
 
 
 def store_queries(
@@ -93,11 +88,11 @@ def store_queries(
     frame: Tensor,
     valid: Tensor,
 ) -> VectorMemory:
-    """Store the queries of the tracks that live on; the oldest entry of each goes.
+    """Store the queries ``(B, T', C)`` of the tracks that live on; the oldest entry of each goes.
 
     Args:
         memory: of the last frame.
-        queries: ``(B, T', C)`` of the tracks that live on.
+        queries: of this frame.
         source: ``(B, T') int64``, their row in ``memory``.
         matched: ``(B, T') bool``, whether they have one; newborn ones do not.
         ego_to_global: ``(B, 4, 4) float64``, current.
@@ -110,7 +105,9 @@ def store_queries(
         return torch.cat([kept[:, :, 1:], newest[:, :, None].to(entries.dtype)], dim=2)
 
     if memory.valid.shape[1] == 0:  # A row to take from, for newborn tracks.
-        memory = VectorMemory(**{name: _one_row(entries) for name, entries in vars(memory).items()})
+        memory = VectorMemory(
+            **{name: entries.new_zeros(len(entries), 1, *entries.shape[2:]) for name, entries in vars(memory).items()}
+        )
     rows = queries.shape[1]
     kept_valid = shifted(memory.valid, valid)
     kept_valid[:, :, :-1] &= (matched & valid)[..., None]
@@ -120,7 +117,3 @@ def store_queries(
         frames=shifted(memory.frames, frame[:, None].expand(-1, rows)),
         valid=kept_valid,
     )
-
-
-def _one_row(entries: Tensor) -> Tensor:
-    return entries.new_zeros(entries.shape[0], 1, *entries.shape[2:])

@@ -25,8 +25,9 @@ class BevEncoder(nn.Module):
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        bev, channels_in = config.bev, config.backbone.channels
+        bev = config.bev
         assert isinstance(bev, LookupBevConfig)
+        channels_in = bev.backbone.channels
         fine, middle, coarse = bev.widths
         self.fine_grid, grid = (2 * bev.rows, 2 * bev.columns), (bev.rows, bev.columns)
         points = [ground_points(self.fine_grid, 0.0, config.roi)]
@@ -56,13 +57,9 @@ class BevEncoder(nn.Module):
     def forward(
         self, levels: Sequence[Tensor], inputs: FrameInputs, geometry: ViewGeometry, state: StreamState | None
     ) -> list[Tensor]:
-        """Encode.
+        """Turn image features of a single level, ``(B, N, C_in, h', w')``, into BEV features.
 
-        Args:
-            levels: image features of a single level, ``(B, N, C_in, h', w')``.
-            inputs: which cameras count.
-            geometry: of :meth:`geometry`.
-            state: not used; past maps enter afterwards (:mod:`predmapnet.network.small.residual_bev_memory`).
+        ``state`` is not used: past maps enter afterwards (:mod:`predmapnet.network.small.residual_bev_memory`).
 
         Returns:
             ``(B, C_0, H, W)``, ``(B, C_1, H / 2, W / 2)`` and ``(B, C_2, H / 4, W / 4)``, sizes rounded up.

@@ -111,7 +111,7 @@ class PointDecoder(MapDecoder):
         super().__init__()
         decoder = config.decoder
         assert isinstance(decoder, PointDecoderConfig)
-        self.one_way = config.tracking.query_assignment == "one_way"
+        self.one_way = decoder.query_assignment == "one_way"
         self.input = Pointwise(config.bev.widths[0], decoder.point_width)
         self.layers = nn.ModuleList(PointLayer(decoder, config.roi) for _ in range(decoder.layers))
 
@@ -131,30 +131,19 @@ class PointDecoder(MapDecoder):
 
 
 def sample_bev(bev: Tensor, positions: Tensor) -> Tensor:
-    """Interpolate BEV features at normalised positions, zeros outside.
-
-    Args:
-        bev: ``(B, D, H, W)``; row 0 is the largest y.
-        positions: ``(B, R, P, K, 2)``, x and y in [0, 1] inside.
-
-    Returns:
-        ``(B, R, P, K, D)``.
-    """
+    """Interpolate the BEV ``(B, D, H, W)`` at normalised ``(B, R, P, K, 2)``, outside zeros: ``(B, R, P, K, D)``."""
     grid = torch.stack([positions[..., 0] * 2 - 1, 1 - positions[..., 1] * 2], dim=-1)
     sampled = F.grid_sample(bev, grid.flatten(1, 2), mode="bilinear", padding_mode="zeros", align_corners=False)
     return sampled.permute(0, 2, 3, 1).unflatten(1, positions.shape[1:3])
 
 
 def visible_rows(track_valid: Tensor, queries: int, one_way: bool) -> Tensor:
-    """Which rows each row may attend to in the decoder.
+    """Return which rows each row may attend to in the decoder: ``(B, T + Q, T + Q) bool``.
 
     Args:
         track_valid: ``(B, T) bool``; padded rows are seen by nobody.
         queries: number of detection queries, which follow the tracks.
         one_way: detections never see tracks, tracks see everything.
-
-    Returns:
-        ``(B, T + Q, T + Q) bool``.
     """
     batch, tracks = track_valid.shape
     rows = tracks + queries

@@ -21,13 +21,7 @@ NEAREST_DEPTH = 0.1
 
 @dataclass(frozen=True)
 class SparseRows:
-    """A sparse matrix, row by row.
-
-    Attributes:
-        columns: ``(nnz,) int32``.
-        starts: ``(rows,) int32``, where each row begins in ``columns``.
-        weights: ``(nnz,) float32``.
-    """
+    """A sparse matrix, row by row: columns and weights ``(nnz,)``, and where each row begins in them, ``(rows,)``."""
 
     columns: Tensor
     starts: Tensor
@@ -75,11 +69,7 @@ class GroundLookup:
 
 
 def ground_points(grid: tuple[int, int], height: float, roi: RegionOfInterest) -> Tensor:
-    """Return the centres of the cells of a grid, at a height above the road.
-
-    Returns:
-        ``(rows * columns, 4) float64``: x and y in metres of the ego frame, height above the road, and 1.
-    """
+    """Return cell centres ``(rows * columns, 4) float64``: x, y (ego frame), height above the road, metres; and 1."""
     x, y = ((cell_centres(*grid).double() - 0.5) * torch.tensor(roi.size)).flatten(0, 1).unbind(-1)
     return torch.stack([x, y, torch.full_like(x, height), torch.ones_like(x)], dim=-1)
 
@@ -87,13 +77,9 @@ def ground_points(grid: tuple[int, int], height: float, roi: RegionOfInterest) -
 def find_on_ground(
     points: Tensor, calibration: Calibration, feature_size: tuple[int, int], stride: int
 ) -> GroundLookup:
-    """Project points of the ground into all cameras of all frames.
+    """Project points ``(K, 4) float64`` of :func:`ground_points` into all cameras of all frames.
 
-    Args:
-        points: ``(K, 4) float64`` of :func:`ground_points`.
-        calibration: of the ``B`` frames.
-        feature_size: rows and columns of the image features.
-        stride: pixels of the network's input per pixel of the features.
+    Image features have ``feature_size`` rows and columns, one for ``stride`` pixels of the network's input.
     """
     batch, cameras = calibration.camera_code.shape
     u, v, depth = _project(points, calibration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from predmapnet.config import PredMapNetConfig, ResidualBevMemoryConfig
+from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.network.ego_motion import relative_motion, warp_bev
 from predmapnet.network.layers import Pointwise, zero_init
 from predmapnet.network.state import StreamState
@@ -19,8 +19,8 @@ class ResidualBevMemory(nn.Module):
 
     def __init__(self, config: PredMapNetConfig) -> None:
         super().__init__()
-        assert isinstance(config.temporal_bev, ResidualBevMemoryConfig)
-        self.config = config.temporal_bev
+        assert isinstance(config.bev, LookupBevConfig)
+        self.config = config.bev.memory
         self.roi = config.roi
         fine, middle, _ = config.bev.widths
         self.compress = Pointwise(fine, self.config.channels)
@@ -63,11 +63,7 @@ class ResidualBevMemory(nn.Module):
         return warped[:, :, :-1].flatten(1, 2), warped[:, :, -1]
 
     def _choose(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
-        """For each distance, find the nearest stored map; one that serves two distances is used for the first.
-
-        Returns:
-            ``(B, D) int64`` and ``(B, D) bool``.
-        """
+        """Find the nearest stored map for each distance ``(B, D)``; validity, as a map serves only one of them."""
         travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1).float()
         wanted = travelled.new_tensor(self.config.distances)
         error = (travelled[:, None] - wanted[:, None]).abs()
@@ -80,16 +76,9 @@ class ResidualBevMemory(nn.Module):
 def store_raw_map(
     state: StreamState, raw: Tensor, ego_to_global: Tensor, spacing: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Store the current raw map; the newest one is replaced until the car has moved ``spacing`` metres past it.
+    """Return the BEV memory (maps, poses, validity) with the raw map ``(B, C_bev, H, W)`` of this frame, newest last.
 
-    Args:
-        state: of the last frame, with ``K`` slots, newest last.
-        raw: ``(B, C_bev, H, W)``.
-        ego_to_global: ``(B, 4, 4) float64``.
-        spacing: metres between the two newest maps from which on the newest one is kept.
-
-    Returns:
-        The new ``bev_memory``, ``bev_memory_pose`` and ``bev_memory_valid``.
+    The newest one is replaced until the car has moved ``spacing`` metres past the one before.
     """
     pose, valid, maps = state.bev_memory_pose, state.bev_memory_valid, state.bev_memory
     if valid.shape[1] == 0:
@@ -113,9 +102,10 @@ def empty_bev_memory(batch: int, config: PredMapNetConfig, device: torch.device)
 
     The residual fusion has a fixed number of slots, none if it is switched off; the encoder's memory grows.
     """
-    temporal, slots, channels = config.temporal_bev, 0, config.bev.widths[0]
-    if isinstance(temporal, ResidualBevMemoryConfig):
-        slots, channels = temporal.capacity if temporal.enabled else 0, temporal.channels
+    slots, channels = 0, config.bev.widths[0]
+    if isinstance(config.bev, LookupBevConfig):
+        memory = config.bev.memory
+        slots, channels = memory.capacity if memory.enabled else 0, memory.channels
     maps = torch.zeros(batch, slots, channels, config.bev.rows, config.bev.columns, device=device)
     pose = torch.eye(4, dtype=torch.float64, device=device).expand(batch, slots, 4, 4).clone()
     return maps, pose, torch.zeros(batch, slots, dtype=torch.bool, device=device)

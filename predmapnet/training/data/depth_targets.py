@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from predmapnet.config import DepthConfig, PredMapNetConfig, ResNet50Config
+from predmapnet.config import BevFormerConfig, DepthConfig, PredMapNetConfig
 from predmapnet.network.image_input import input_size, window_camera
 from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
 from predmapnet.network.small.backbone import STRIDE
@@ -48,7 +48,7 @@ def depth_of_frame(points: Float | None, rig: Rig, config: PredMapNetConfig) -> 
     Returns:
         As small an integer type as holds the bins.
     """
-    stride = LEVEL_STRIDES[0] if isinstance(config.backbone, ResNet50Config) else STRIDE
+    stride = LEVEL_STRIDES[0] if isinstance(config.bev, BevFormerConfig) else STRIDE
     cameras = tuple(window_camera(camera, config.image) for camera in rig)
     seen = depth_targets(np.zeros((0, 3)) if points is None else points, cameras, stride, config.depth)
     missing = [-(-size // stride) - cells for size, cells in zip(input_size(config.image), seen.shape[1:], strict=True)]

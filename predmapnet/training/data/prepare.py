@@ -184,6 +184,6 @@ def cache_folder(cache: Path, dataset: str, config: PredMapNetConfig) -> Path:
         dataset: its name, with what tells it from others of that name.
         config: of the network.
     """
-    depth = f" {config.depth} {config.backbone.kind}" if config.depth.enabled else ""
+    depth = f" {config.depth} {config.bev.kind}" if config.depth.enabled else ""
     key = f"{config.image} {config.bev.kind} {config.roi_length} {config.roi_width}{depth}"
     return cache / f"{dataset}-{config.image.width}x{config.image.height}-{sha256(key.encode()).hexdigest()[:8]}"

@@ -51,10 +51,23 @@ class LossWeights:
 
 PAPER_LOSSES = LossWeights()
 LITE_LOSSES = LossWeights(
-    **{"focal": 3.0, "points": 1.5, "direction": 0.3, "beta": 0.05, "metres": True},
-    **{"mask_dice": 1.0, "mask_entropy": 5.0, "segmentation": 6.0, "segmentation_dice": 2.0},
-    **{"forecast": 0.5, "forecast_points": 0.5, "depth": 0.0, "transformation": 0.0},
-    **{"cost_focal": 3.0, "cost_points": 1.2, "cost_beta": 0.0, "cost_mask": 2.0},
+    focal=3.0,
+    points=1.5,
+    direction=0.3,
+    beta=0.05,
+    metres=True,
+    mask_dice=1.0,
+    mask_entropy=5.0,
+    segmentation=6.0,
+    segmentation_dice=2.0,
+    forecast=0.5,
+    forecast_points=0.5,
+    depth=0.0,
+    transformation=0.0,
+    cost_focal=3.0,
+    cost_points=1.2,
+    cost_beta=0.0,
+    cost_mask=2.0,
     focal_segmentation=False,
     mean_over_frames=True,
 )

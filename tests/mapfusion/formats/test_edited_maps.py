@@ -252,17 +252,6 @@ def geopackage(path, *statements):
     database.close()
 
 
-def test_a_style_inside_a_geopackage_is_no_layer(tmp_path):
-    path = tmp_path / "map.gpkg"
-    geopackage(
-        path,
-        "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, f_table_name TEXT, styleQML TEXT)",
-        "INSERT INTO gpkg_contents (table_name, data_type, identifier) "
-        "VALUES ('layer_styles', 'attributes', 'layer_styles')",
-    )
-    assert len(read_map(path, PLANE)) == 2
-
-
 def test_nulls_in_a_geopackage_are_read_and_rows_without_geometry_left_out(tmp_path):
     path = tmp_path / "map.gpkg"
     geopackage(

@@ -1,4 +1,4 @@
-"""What must not change the map: order of frames, place of the world, repeated frames, pauses, broken input."""
+"""Invariance of the fused map: order of frames, place of the world, repeated frames, pauses, broken input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which sweeps the published Argoverse 2 benchmarks take: dropped without images, counted across logs."""
+"""Frames of the published Argoverse 2 benchmarks: sweeps with all images, counted across logs."""
 
 import numpy as np
 import pytest

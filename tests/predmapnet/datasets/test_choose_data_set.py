@@ -1,4 +1,4 @@
-"""Which data set a command gets, and what it is told when there is none where it was said to be."""
+"""Choice of the data set by option, environment and folder; messages where it is missing."""
 
 import pytest
 

@@ -85,7 +85,7 @@ def test_the_map_of_the_whole_scene(nuscenes_root):
     truth = NuScenesSource(nuscenes_root).open("scene-0061").truth_map()
     # Three frames at x = 80.9, 85.9 and 90.9 see x from 50.9 to 120.9.
     lengths = [truth.length(kind) for kind in range(3)]
-    np.testing.assert_allclose(lengths, [22.0, 70.0, 140.0], atol=1e-6)
+    np.testing.assert_allclose(lengths, [8.0, 70.0, 140.0], atol=1e-6)
     assert [len(truth.of_kind(kind)) for kind in range(3)] == [1, 1, 2]
     assert truth.elements[1].observations == 3
 

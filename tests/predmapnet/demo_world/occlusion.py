@@ -1,17 +1,15 @@
-"""How much of the painted road in view is hidden behind things: the measure of how hard a scene is to see."""
+"""Share of the painted road in view that is hidden behind things: how hard a scene is to see."""
 
 from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.scenes import Rig
-
-Float = NDArray[np.float64]
 
 
 def painted_points(renderer: Renderer, spacing: float = 0.5) -> Float:

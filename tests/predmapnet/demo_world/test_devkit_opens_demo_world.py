@@ -1,29 +1,21 @@
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from predmapnet.demo_world.catalogue import ensure_scene, trajectory, vector_map
+from tests.environments import python_with
 
 pytestmark = pytest.mark.devkit
 
-DEVKIT = ["nuscenes-devkit==1.2.0", "numpy<2"]
+DEVKIT = "nuscenes-devkit==1.2.0 numpy<2"
 
 
-@pytest.fixture(scope="module")
-def devkit_python(tmp_path_factory):
-    """An environment of its own: the devkit pins numpy below 2, Rerun needs numpy 2."""
-    folder = tmp_path_factory.mktemp("devkit")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
-    python = folder / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "--quiet", *DEVKIT], check=True)
-    return python
-
-
-def test_devkit_opens_tables_images_lidar_and_map_without_complaint(devkit_python, tmp_path):
+def test_devkit_opens_tables_images_lidar_and_map_without_complaint(tmp_path):
+    """In an environment of its own: the devkit pins numpy below 2, Rerun needs numpy 2."""
+    devkit_python = python_with("nuscenes-devkit", tmp_path, DEVKIT)
     folder = ensure_scene("scene-0103", tmp_path)
     script = Path(__file__).with_name("open_with_devkit.py")
     run = subprocess.run(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.evaluation.ahead_rear_ap import Half, cut_at_middle, half_matches
 from predmapnet.evaluation.frames import EvaluationFrame
-from predmapnet.evaluation.precision_recall import accumulate_matches
+from predmapnet.evaluation.precision_recall import accumulate
 from predmapnet.scenes import FrameTruth
 
 THRESHOLDS = (0.5, 1.0, 1.5)
@@ -36,7 +36,7 @@ def frame(predicted, truth, kind=1):
 
 
 def divider_ap(half, predicted, truth):
-    result = accumulate_matches([half_matches(frame(predicted, truth), half, THRESHOLDS)], THRESHOLDS)
+    result = accumulate([half_matches(frame(predicted, truth), half, THRESHOLDS)], THRESHOLDS)
     return result.kinds[1].average_precision
 
 

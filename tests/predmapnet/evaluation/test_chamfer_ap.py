@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, chamfer_from_flags, frame_flags
+from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, frame_matches
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
 from predmapnet.evaluation.frames import simplify_all
+from predmapnet.evaluation.precision_recall import accumulate
 
 
 def test_simplified_truth_is_the_official_one(case):
@@ -16,10 +17,10 @@ def test_simplified_truth_is_the_official_one(case):
 
 
 def test_every_subset_has_the_official_average_precision(case):
-    flags = [frame_flags(frame) for frame in case.frames]
+    matches = [frame_matches(frame) for frame in case.frames]
     for subset, expected in case.expected["chamfer_ap"]["stable"].items():
         rows = case.subset(subset)
-        result = chamfer_from_flags([case.frames[row] for row in rows], [flags[row] for row in rows], (0.5, 1.0, 1.5))
+        result = accumulate([matches[row] for row in rows], (0.5, 1.0, 1.5))
         assert result.mean == pytest.approx(expected["mAP"], abs=1e-6), subset
         for kind in result.kinds:
             figures = expected[kind.kind.label]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from predmapnet.evaluation.chamfer_ap import chamfer_from_flags
 from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
-from predmapnet.evaluation.consistency_ap import consistency_flags, matched_tracks
+from predmapnet.evaluation.consistency_ap import consistency_matches, matched_tracks
+from predmapnet.evaluation.precision_recall import accumulate
 from predmapnet.evaluation.tracks import form_tracks, truth_track_ids
 
 THRESHOLDS = (0.5, 1.0, 1.5)
@@ -60,14 +60,14 @@ def test_formed_tracks_are_the_official_ones_in_the_official_order(case, formed)
 @pytest.mark.parametrize("mode", ["stable", "stable_no_consistency"])
 def test_every_subset_has_the_official_average_precision(case, truth_ids, formed, kind, mode):
     frames = frames_of_kind(case, formed, kind)
-    flags, start = [], 0
+    matches, start = [], 0
     for scene in by_scene(case, frames):
         matched = matched_tracks(scene, truth_ids[start : start + len(scene)], THRESHOLDS)
-        flags += consistency_flags(scene, matched, anchored=mode == "stable")
+        matches += consistency_matches(scene, matched, anchored=mode == "stable")
         start += len(scene)
     for subset, expected in case.expected["cmap"][kind][mode].items():
         rows = case.subset(subset)
-        result = chamfer_from_flags([frames[row] for row in rows], [flags[row] for row in rows], THRESHOLDS)
+        result = accumulate([matches[row] for row in rows], THRESHOLDS)
         assert result.mean == pytest.approx(expected["mAP"], abs=1e-6), subset
         for entry in result.kinds:
             figures = expected[entry.kind.label]
@@ -80,12 +80,12 @@ def test_every_subset_has_the_official_average_precision(case, truth_ids, formed
         if kind == "own_ids":
             ours = {
                 row: flag
-                for rows, frame_flags in zip(case.predicted_rows, flags, strict=True)
-                for row, flag in zip(rows, frame_flags, strict=True)
+                for rows, match in zip(case.predicted_rows, matches, strict=True)
+                for row, flag in zip(rows, match.flags, strict=True)
             }
             found = np.array([ours[row] for row in case.intermediates["own_pred_row"]])
         else:
-            found = np.concatenate(flags)
+            found = np.concatenate([match.flags for match in matches])
         np.testing.assert_array_equal(found, given)
 
 

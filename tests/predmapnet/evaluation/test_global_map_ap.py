@@ -6,7 +6,7 @@ import shapely
 
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from predmapnet.evaluation.global_map_ap import global_map_matches
-from predmapnet.evaluation.precision_recall import accumulate_matches
+from predmapnet.evaluation.precision_recall import accumulate
 
 THRESHOLDS = (0.5, 1.0, 1.5)
 ORIGIN = np.array([1_000.0, 2_000.0])
@@ -18,7 +18,7 @@ def element(points, confidence=0.9, kind=ElementKind.DIVIDER):
 
 
 def measured(*maps):
-    return accumulate_matches(
+    return accumulate(
         [global_map_matches(GlobalMap(tuple(found)), GlobalMap(tuple(true)), SEEN, THRESHOLDS) for found, true in maps],
         THRESHOLDS,
     )

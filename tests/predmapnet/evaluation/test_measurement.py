@@ -101,9 +101,10 @@ def test_the_report_needs_nothing_else_and_the_json_has_the_promised_keys(tmp_pa
     frames, truth_map = drive(offset=0.7)
     scene = measure_scene(frames, truth_map, truth_map)
     measurement = pool_scenes([scene])
-    write_report(tmp_path / "report.html", measurement, CONTEXT, {"scene-0001": scene_figures(scene)}, ORIGIN)
+    figures_of, maps = {"scene-0001": scene_figures(scene)}, {"scene-0001": (truth_map, truth_map)}
+    write_report(tmp_path / "report.html", measurement, CONTEXT, figures_of, ORIGIN, maps)
     html = (tmp_path / "report.html").read_text()
-    for text in (*ORIGIN.values(), "these are few scenes", "<td>scene-0001</td><td>6</td>"):
+    for text in (*ORIGIN.values(), "these are few scenes", ">scene-0001</td>", '"rows":["scene-0001"]'):
         assert text in html
     assert not re.findall(r"(?:src|href|url)\s*[=(]", html)
     assert html.count("<svg") >= 3 + 2 + 2 * len(frames)

@@ -1,4 +1,4 @@
-"""What holds for any prediction, and the inputs that break careless code."""
+"""Properties of the metrics for any prediction, and inputs that break careless code."""
 
 from dataclasses import replace
 

@@ -23,8 +23,8 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs, Instances
 from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import Checkpoint, load_checkpoint
-from tests.predmapnet.network.paper_network import opened, tiny_config
-from tests.predmapnet.network.small_baseline import small_config
+from tests.predmapnet.network.paper_network import tiny_config
+from tests.predmapnet.small_networks import opened, small_config
 
 TOLERANCE = 1e-3
 

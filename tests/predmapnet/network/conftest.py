@@ -5,21 +5,11 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs
-
-SMALL = {
-    "image": {"width": 64, "height": 24},
-    "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
-    "bev": {"rows": 26, "columns": 52, "widths": (16, 24, 32)},
-    "temporal_bev": {"channels": 4, "capacity": 5},
-    "masks": {"channels": 16},
-    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
-    "future": {"hidden": 32},
-}
+from tests.predmapnet.small_networks import small_config
 
 
 @pytest.fixture
@@ -36,9 +26,8 @@ def make_network() -> Callable[..., PredMapNet]:
     """Return a maker of small networks in evaluation mode; keyword arguments change sections of the configuration."""
 
     def make(seed: int = 0, **sections: dict[str, object]) -> PredMapNet:
-        values = {name: {**SMALL.get(name, {}), **sections.get(name, {})} for name in {*SMALL, *sections}}
         torch.manual_seed(seed)
-        return PredMapNet(PredMapNetConfig.model_validate(values)).eval()
+        return PredMapNet(small_config("lite", **sections)).eval()
 
     return make
 

@@ -15,40 +15,15 @@ from predmapnet.network.layers import Attention
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures, FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
-from predmapnet.presets import parse_config, preset
-from tests.predmapnet.network.small_baseline import small_config
+from predmapnet.presets import parse_config
+from tests.predmapnet.small_networks import opened, small_config
 
 SIZES = ("paper", "lite")
-LITE = {
-    "image": {"width": 64, "height": 24},
-    "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
-    "bev": {"rows": 20, "columns": 40, "widths": (16, 24, 32)},
-    "temporal_bev": {"channels": 4, "capacity": 5},
-    "masks": {"channels": 16},
-    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
-    "future": {"hidden": 32},
-}
 
 
 def tiny_config(size: str, **sections: dict[str, object]) -> PredMapNetConfig:
     """Return ``paper-nuscenes`` or ``lite`` made small; keyword arguments change sections further."""
-    if size == "paper":
-        return small_config("paper-nuscenes", **sections)
-    values = preset("lite").model_dump()
-    for changes in (LITE, sections):
-        for section, change in changes.items():
-            values[section] |= change
-    return PredMapNetConfig.model_validate(values)
-
-
-def opened(module: nn.Module, seed: int = 0) -> nn.Module:
-    """Give branches and biases that begin as zero the weights that training would, and switch to evaluation."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in module.parameters():
-            if not parameter.any():
-                parameter.normal_(0, 0.3, generator=generator)
-    return module.eval()
+    return small_config("paper-nuscenes" if size == "paper" else "lite", **sections)
 
 
 def tiny_network(size: str, **sections: dict[str, object]) -> PredMapNet:
@@ -70,11 +45,6 @@ def bev_levels(config: PredMapNetConfig, batch: int = 1, seed: int = 0) -> list[
     rows, columns = config.bev.rows, config.bev.columns
     sizes = [(-(-rows // scale), -(-columns // scale)) for scale in (1, 2, 4)]
     return [torch.randn(batch, w, *s, generator=generator) for w, s in zip(config.bev.widths, sizes, strict=True)]
-
-
-def mask_level(config: PredMapNetConfig) -> int:
-    """Return which of the BEV levels has the grid of the masks."""
-    return 1 if config.masks.stride == 2 else 0
 
 
 def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Tensor:

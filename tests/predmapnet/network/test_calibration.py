@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
@@ -15,8 +14,7 @@ from predmapnet.network.calibration import calibrate, collate_calibrations, pad_
 from predmapnet.network.small.backbone import STRIDE
 from predmapnet.network.small.ground_lookup import find_on_ground, ground_points, to_ground
 from predmapnet.network.state import FrameInputs
-from tests.predmapnet.network.conftest import SMALL
-from tests.predmapnet.network.small_baseline import small_config, small_network
+from tests.predmapnet.small_networks import small_config, small_network
 
 
 def moved(rig, metres):
@@ -35,10 +33,8 @@ CARS = (DEMO_RIG, moved(DEMO_RIG, 0.8)[2:4], DEMO_RIG[:1])
 
 
 def network_and_config(name, **sections):
-    if name == "lite":
-        values = {key: {**SMALL.get(key, {}), **sections.get(key, {})} for key in {*SMALL, *sections}}
-        return small_network(PredMapNetConfig.model_validate(values))
-    return small_network(small_config(name, bev={"cameras": NUSCENES_CAMERAS}))
+    bev = {} if name == "lite" else {"cameras": NUSCENES_CAMERAS}
+    return small_network(small_config(name, **{"bev": bev, **sections}))
 
 
 def inputs_of(rig, config, seed=0):
@@ -130,7 +126,7 @@ def test_codes_of_cameras_are_found_by_name_and_unknown_cameras_are_named():
 
 @torch.no_grad()
 def test_a_network_that_looks_at_further_heights_starts_as_the_one_that_does_not():
-    flat = network_and_config("lite")
+    flat = network_and_config("lite", bev={"further_heights": ()})
     raised = network_and_config("lite", bev={"further_heights": (-0.5, 0.5)})
     missing, unexpected = raised.load_state_dict(flat.state_dict(), strict=False)
     assert (missing, unexpected) == (["bev_encoder.heights.weight"], [])
@@ -144,8 +140,8 @@ def test_a_network_that_looks_at_further_heights_starts_as_the_one_that_does_not
 @torch.no_grad()
 def test_each_height_has_weights_of_its_own():
     encoder = network_and_config("lite", bev={"further_heights": (-0.5, 0.5)}).bev_encoder
-    config = PredMapNetConfig.model_validate(SMALL)
-    grid, channels = (config.bev.rows, config.bev.columns), config.backbone.channels
+    config = small_config("lite")
+    grid, channels = (config.bev.rows, config.bev.columns), config.bev.backbone.channels
     calibration = calibrate(DEMO_RIG, config)
     size = (config.image.height, config.image.width)
     features = torch.randn(1, len(DEMO_RIG), channels, size[0] // STRIDE, size[1] // STRIDE)

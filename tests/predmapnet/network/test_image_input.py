@@ -1,4 +1,4 @@
-"""What reaches the network of a photograph, and where a point of the road is found in it."""
+"""Image input: the pixels that reach the network, and the projection of road points into them."""
 
 import json
 from dataclasses import replace

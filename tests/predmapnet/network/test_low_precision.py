@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.machine import Precision
 from predmapnet.network.calibration import calibrate
@@ -11,8 +10,7 @@ from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
-from tests.predmapnet.network.conftest import SMALL
-from tests.predmapnet.network.small_baseline import frames, small_config, small_network
+from tests.predmapnet.small_networks import frames, small_config, small_network
 
 FRAMES = 3
 
@@ -29,7 +27,7 @@ def lite_frames(config):
 def case(name):
     """A network and frames for it."""
     if name == "lite":
-        network = small_network(PredMapNetConfig.model_validate(SMALL))
+        network = small_network(small_config(name))
         for parameter in (value for key, value in network.named_parameters() if key.endswith("classify.bias")):
             torch.nn.init.constant_(parameter, 0.5)  # So that there are tracks.
         return network, list(lite_frames(network.config))

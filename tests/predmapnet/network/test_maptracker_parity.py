@@ -8,9 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from predmapnet.network.layers import interleaved_sines
 from predmapnet.network.maptracker.bev_memory import PastBevMaps, warp_past_maps
 from predmapnet.network.maptracker.reference_points import ReferencePoints, project_pillars
-from predmapnet.network.maptracker.vector_memory import age_code, recall_queries
+from predmapnet.network.maptracker.vector_memory import recall_queries
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import FrameInputs, FrameOutputs, Selection, StreamState
 from predmapnet.network.track_selection import select
@@ -233,7 +234,7 @@ class Step:
         empty = ~recalled.valid[0].T[..., None]
         computed = torch.arange(recalled.slots.shape[-1])[:, None] < self.state.frame
         nothing = self.calls["propagation.motion"][0][1][0].transpose(0, 1) * computed[..., None]
-        oldest = age_code(self.state.frame * computed, recalled.code.shape[-1])
+        oldest = interleaved_sines(self.state.frame * computed, recalled.code.shape[-1])
         return {
             "memory.embeds_propagated": torch.where(empty, nothing, recalled.queries[0].transpose(0, 1)),
             "memory.key_padding_mask": ~recalled.valid[0],

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from predmapnet.config import ALL_QUIRKS, MapTrackerQuirks
+from predmapnet.config import DecoderQuirks, EncoderQuirks
 from predmapnet.network.ego_motion import invert_pose, quaternion
 from predmapnet.network.kernels.deformable_attention import deformable_attention
 from predmapnet.network.kernels.deformable_convolution import DeformableConvolution
 from predmapnet.network.kernels.normalised_convolution import NormalisedConvolution
 from predmapnet.network.maptracker.bev_memory import warp_grid
 from predmapnet.network.maptracker.strided_selection import select_strided
-from tests.predmapnet.network.small_baseline import (
+from tests.predmapnet.small_networks import (
     frames,
     small_config,
     small_network,
@@ -26,7 +26,7 @@ from tests.predmapnet.network.small_baseline import (
 
 SMALL = small_config()
 QUERIES = SMALL.decoder.queries
-NO_QUIRKS = MapTrackerQuirks()
+NO_QUIRKS = small_config(bev={"quirks": EncoderQuirks().model_dump()}, decoder={"quirks": DecoderQuirks().model_dump()})
 
 
 def plain_deformable_convolution(convolution: DeformableConvolution, features: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ def test_history_is_chosen_as_the_plain_rule_says(travelled, unused, fallback):
 def test_without_the_quirk_the_warp_by_no_motion_changes_nothing():
     still = torch.eye(4, dtype=torch.float64)[None]
     maps = torch.rand(1, 3, SMALL.bev.rows, SMALL.bev.columns)
-    plain = F.grid_sample(maps, warp_grid(still, SMALL.model_copy(update={"quirks": NO_QUIRKS})), align_corners=False)
+    plain = F.grid_sample(maps, warp_grid(still, NO_QUIRKS), align_corners=False)
     torch.testing.assert_close(plain, maps, atol=1e-5, rtol=0)
     zoomed = F.grid_sample(maps, warp_grid(still, SMALL), align_corners=False)
     assert (zoomed - maps).abs().max() > 0.1
@@ -147,7 +147,7 @@ def test_without_the_quirk_the_warp_by_no_motion_changes_nothing():
 @torch.no_grad()
 def test_a_track_moves_against_the_car_and_stays_on_the_border():
     """The car drives 6 m forward: a point 6 m ahead is now here; what leaves the region stays on its border."""
-    network = small_network(small_config(quirks={"tracks_moved_from_chosen_history": False}))
+    network = small_network(small_config(decoder={"quirks": {"tracks_moved_from_chosen_history": False}}))
     first, second = frames(2, 0, step=6.0)
     _, state = step(network, first, None)
     state.instances.points[0, 0, :2] = torch.tensor([[0.6, 0.5], [0.05, 0.25]])
@@ -155,10 +155,10 @@ def test_a_track_moves_against_the_car_and_stays_on_the_border():
     torch.testing.assert_close(carried.points[0, 0, :2], torch.tensor([[0.5, 0.5], [0.0, 0.25]]))
 
 
-@pytest.mark.parametrize("quirks", [ALL_QUIRKS, NO_QUIRKS], ids=["quirks", "no quirks"])
+@pytest.mark.parametrize("config", [SMALL, NO_QUIRKS], ids=["quirks", "no quirks"])
 @torch.no_grad()
-def test_streams_side_by_side_give_what_each_gives_alone(quirks):
-    network = small_network(SMALL.model_copy(update={"quirks": quirks}))
+def test_streams_side_by_side_give_what_each_gives_alone(config):
+    network = small_network(config)
     streams = [frames(7, seed) for seed in (0, 1)]
     alone = []
     for stream in streams:
@@ -192,7 +192,7 @@ def test_memory_keeps_no_more_than_its_capacity():
     network, state = small_network(SMALL), None
     for inputs in frames(9, 0):
         _, state = step(network, inputs, state)
-    assert state.bev_memory.shape[1] == SMALL.temporal_bev.capacity
+    assert state.bev_memory.shape[1] == SMALL.bev.memory.capacity
     assert state.vector_memory.valid.shape[2] == SMALL.decoder.memory_capacity
     ages = (state.frame[:, None, None] - state.vector_memory.frames)[state.vector_memory.valid]
     assert ages.max() <= SMALL.decoder.memory_capacity

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate, collate_calibrations
+from predmapnet.network.maptracker.resnet import ResNet50Pyramid
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures
 from predmapnet.network.track_selection import select
@@ -16,17 +16,18 @@ from predmapnet.training.data.targets import Targets
 from predmapnet.training.instants import StageTraining
 from predmapnet.training.optimiser import WeightAverage, make_optimiser
 from predmapnet.training.settings import LITE_STAGES, NUSCENES_STAGES, OptimiserSettings, TrackRules
-from tests.predmapnet.network.conftest import SMALL
-from tests.predmapnet.network.small_baseline import SIZE, small_config, two_cameras
 from tests.predmapnet.pretended_gpu import pretended_gpu
+from tests.predmapnet.small_networks import SIZE, PlainBackbone, small_config, two_cameras
 
 STREAMS, FRAMES = 2, 3
 
 
 def network_of(config):
-    """An untrained network whose every row is confident enough for a track."""
+    """An untrained network whose every row is confident enough for a track; what a ResNet does is tested by itself."""
     torch.manual_seed(0)
     network = PredMapNet(config).train()
+    if config.bev.kind == "bevformer":
+        network.image_backbone = PlainBackbone(config.bev.width)
     for name, parameter in network.named_parameters():
         if name.endswith("classify.bias"):
             torch.nn.init.constant_(parameter, 0.5)
@@ -81,7 +82,7 @@ def optimise(network, terms, gpu):
 @pytest.mark.parametrize("name", ["lite", "maptracker-nuscenes", "paper-nuscenes"])
 def test_a_stream_stays_on_the_gpu(name):
     is_lite = name == "lite"
-    config = PredMapNetConfig.model_validate(SMALL) if is_lite else small_config(name)
+    config = small_config(name)
     size, cameras = ((24, 64), 6) if is_lite else (SIZE, 2)
     network = network_of(config).eval()
     frames = [instant(config, number, size, cameras) for number in range(FRAMES)]
@@ -112,8 +113,19 @@ def test_a_training_step_of_the_papers_network_stays_on_the_gpu(stage):
         optimise(network, terms, gpu)
 
 
+def test_a_training_step_of_a_resnet_stays_on_the_gpu():
+    torch.manual_seed(0)
+    network = ResNet50Pyramid(16).train()
+    with pretended_gpu() as gpu:
+        gpu.put_network(network)
+        levels = network(gpu.put(torch.randn(1, 3, 64, 64)))
+        assert all(level.device == gpu.device for level in levels)
+        sum(level.sum() for level in levels).backward()
+        assert all(p.grad.device == gpu.device for p in network.parameters() if p.grad is not None)
+
+
 def test_a_training_step_of_lite_streams_stays_on_the_gpu():
-    config = PredMapNetConfig.model_validate(SMALL)
+    config = small_config("lite")
     network = network_of(config)
     stage = replace(LITE_STAGES[1], tracks=TrackRules(score=0.05))
     frames = [instant(config, number, (24, 64), 6) for number in range(FRAMES)]

@@ -15,7 +15,6 @@ from tests.predmapnet.network.paper_network import (
     cell_codes,
     decode,
     keep,
-    mask_level,
     one_frame_later,
     opened,
     pose,
@@ -132,7 +131,7 @@ def guidance_case(size, **sections):
     queries = torch.randn(1, 3, config.decoder.width, generator=generator)
     maps = torch.rand(1, 3, *config.mask_size, generator=generator)
     maps[:, 2] = 0.5  # Nowhere above theta.
-    return guidance, queries, torch.tensor([[0, 2, 1]]), maps, bev_levels(config)[mask_level(config)]
+    return guidance, queries, torch.tensor([[0, 2, 1]]), maps, bev_levels(config)[config.mask_level]
 
 
 @torch.no_grad()

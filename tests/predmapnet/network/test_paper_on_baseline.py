@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from predmapnet.config import MapTrackerQuirks
+from predmapnet.config import DecoderQuirks, EncoderQuirks
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import StreamState
 from predmapnet.network.track_selection import instances_from_rows
-from tests.predmapnet.network.small_baseline import frames, small_config, small_network, step, together
+from tests.predmapnet.small_networks import frames, small_config, small_network, step, together
 
 OFF = {
     "semantic_queries": {"enabled": False},
@@ -88,8 +88,8 @@ def test_weights_of_the_baseline_fill_all_but_the_new_modules():
 @pytest.mark.parametrize("quirks", [True, False])
 def test_gradient_reaches_every_parameter(quirks):
     """Over a clip of three frames; the motion perceptron learns from a loss of its own (MapTracker's)."""
-    names = MapTrackerQuirks.model_fields
-    config = small_config("paper-nuscenes", history_map={"threshold": 0.0}, quirks=dict.fromkeys(names, quirks))
+    bev, decoder = ({"quirks": dict.fromkeys(part.model_fields, quirks)} for part in (EncoderQuirks, DecoderQuirks))
+    config = small_config("paper-nuscenes", history_map={"threshold": 0.0}, bev=bev, decoder=decoder)
     network = small_network(config).train()
     for parameter in network.parameters():
         if not parameter.any():
@@ -139,16 +139,15 @@ def test_a_masked_camera_reaches_nothing(training):
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
+POINTS = {"kind": "points", "queries": 12, "points": 5, "width": 32, "heads": 4, "layers": 2}
 MIXED = {
     "points decoder on bevformer": {
-        "decoder": {"kind": "points", "queries": 12, "points": 5, "width": 32, "heads": 4, "layers": 2},
-        "quirks": {"norm_before_cross_attention": False, "single_precision_memory_poses": False}
-        | {"tracks_moved_from_chosen_history": False},
+        "decoder": {**POINTS, "query_assignment": "suppress"},
     },
     "one way": {
-        "decoder": {"kind": "points", "queries": 12, "points": 5, "width": 32, "heads": 4, "layers": 2},
-        "quirks": dict.fromkeys(MapTrackerQuirks.model_fields, False),
-        "tracking": {"query_assignment": "one_way", "merge": True, "tau_d": 0.04, "tau_t": 0.03},
+        "decoder": POINTS,
+        "bev": {"quirks": dict.fromkeys(EncoderQuirks.model_fields, False)},
+        "tracking": {"merge": True, "tau_d": 0.04, "tau_t": 0.03},
     },
 }
 

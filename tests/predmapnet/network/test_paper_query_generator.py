@@ -10,7 +10,6 @@ from tests.predmapnet.network.paper_network import (
     attention_by_hand,
     bev_levels,
     cell_codes,
-    mask_level,
     opened,
     tiny_config,
 )
@@ -98,7 +97,7 @@ def test_masks_are_products_of_queries_and_bev_features_and_the_last_ones_are_of
     generator, head = parts(config)
     levels = bev_levels(config)
     features = head.mask_features(levels)
-    level = levels[mask_level(config)]
+    level = levels[config.mask_level]
     projected = torch.einsum("bchw,mc->bmhw", level, head.features.weight.view(config.masks.channels, -1))
     torch.testing.assert_close(features, projected + head.features.bias[:, None, None], atol=1e-4, rtol=1e-4)
     generated = generate(generator, head, levels, features)

@@ -1,4 +1,4 @@
-"""Which queries are carried forward: the thresholds tau_d and tau_t of Sec. 3.1 with the values of Sec. 4.1."""
+"""Queries that are carried forward: the thresholds tau_d and tau_t of Sec. 3.1 with the values of Sec. 4.1."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def test_all_modules_of_the_paper_are_on_and_nothing_is_added_to_its_tracking(na
     assert config.semantic_queries.enabled and config.history_map.memory and config.history_map.guidance
     assert config.future.enabled and config.depth.enabled
     assert not config.future.steady_motion
-    assert config.tracking.query_assignment == "suppress"
+    assert config.decoder.query_assignment == "suppress"
     assert config.tracking.misses_allowed == 0 and not config.tracking.merge and not config.revival.enabled
     assert config.tracking.first_tau_d is None
 

@@ -5,15 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from predmapnet.config import PredMapNetConfig
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.track_selection import instances_from_rows
-from tests.predmapnet.network.conftest import SMALL
+from tests.predmapnet.small_networks import small_config
 
 MODULES = {
     "history_map": {"history_map": {"guidance": False, "memory": False}},
     "future": {"future": {"enabled": False}},
-    "temporal_bev": {"temporal_bev": {"enabled": False}},
+    "temporal_bev": {"bev": {"memory": {"enabled": False}}},
     "depth": {"depth": {"enabled": False}},
 }
 
@@ -80,8 +79,7 @@ def test_masks_exist_only_where_a_module_needs_them(sections, make_network, make
 @torch.no_grad()
 def test_the_larger_decoder_works_on_the_lighter_encoder(make_inputs):
     decoder = {"kind": "maptracker", "queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "hidden": 32}
-    tracking = {"query_assignment": "suppress"}
-    network = PredMapNet(PredMapNetConfig.model_validate({**SMALL, "decoder": decoder, "tracking": tracking})).eval()
+    network = PredMapNet(small_config("lite", decoder=decoder)).eval()
     state = None
     for number in range(3):
         inputs = make_inputs(2, seed=number, x=2.0 * number)
@@ -102,7 +100,7 @@ def test_an_empty_state_is_the_same_as_none(network, make_inputs):
 @torch.no_grad()
 def test_detections_never_see_tracks_one_way_but_do_when_tracks_suppress(make_network, make_inputs):
     for assignment, differs in (("one_way", False), ("suppress", True)):
-        network = make_network(temporal_bev={"enabled": False}, tracking={"query_assignment": assignment})
+        network = make_network(bev={"memory": {"enabled": False}}, decoder={"query_assignment": assignment})
         wake(network)
         inputs = make_inputs(x=1.0)
         state = tracked_state(network, make_inputs)

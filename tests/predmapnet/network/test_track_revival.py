@@ -88,7 +88,7 @@ class Drive:
             query_valid=torch.cat([self.state.instances.valid, torch.ones(streams, rows, dtype=torch.bool)], dim=1),
             query_track_ids=torch.cat([self.state.instances.track_ids, torch.full((streams, rows), -1)], dim=1),
             segmentation=torch.zeros(1),
-            bev=torch.zeros(streams, config.temporal_bev.channels, config.bev.rows, config.bev.columns),
+            bev=torch.zeros(streams, config.bev.memory.channels, config.bev.rows, config.bev.columns),
             ego_to_global=poses,
             warped_history=self.state.history_maps,
         )

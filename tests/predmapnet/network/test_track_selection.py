@@ -1,4 +1,4 @@
-"""Which rows live on: birth, support, merging, ids."""
+"""Track selection: birth, support, merging, ids."""
 
 import torch
 

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 
 from mapfusion.colours import KIND_COLOURS
 from mapfusion.elements import RegionOfInterest
-from mapfusion.geometry import arc_length
 from predmapnet.recording.palette import raster_picture
-from predmapnet.recording.projection import bev_pixels, dashes, densify, project_line, true_runs
+from predmapnet.recording.projection import bev_pixels, dashes, project_line, true_runs
 from predmapnet.scenes import Camera
 
 FORWARD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -57,14 +56,6 @@ def test_runs_cover_the_true_values_that_have_a_true_neighbour(values):
         covered[run] = True
     padded = np.pad(mask, 1)
     np.testing.assert_array_equal(covered, mask & (padded[:-2] | padded[2:]))
-
-
-def test_densify_keeps_the_vertices_and_bounds_the_steps():
-    corner = np.array([[0.0, 0.0], [3.3, 0.0], [3.3, 1.0]])
-    dense = densify(corner, 0.5)
-    assert np.diff(arc_length(dense)).max() <= 0.5 + 1e-9
-    assert any(np.allclose(point, corner[1]) for point in dense)
-    np.testing.assert_allclose(arc_length(dense)[-1], 4.3)
 
 
 def test_dashes_cover_their_share_of_the_line():

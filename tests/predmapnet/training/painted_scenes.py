@@ -14,31 +14,29 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import window_intrinsics
-from predmapnet.presets import preset
 from predmapnet.scenes import FrameTruth, Rig
 from predmapnet.training.data.depth_targets import depth_of_frame
 from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.fill_cache import write_index
 from predmapnet.training.data.scene_cache import CachedScene, frame_arrays, frame_path, write_arrays
+from tests.predmapnet.small_networks import small_config
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))
 
 
 def tiny_config() -> PredMapNetConfig:
     """The lite network, made small enough for tests."""
-    changes = {
-        "image": {"width": 128, "height": 48},
-        "backbone": {"stem": (8, 16), "widths": (16, 16, 24), "blocks": (1, 1, 1), "channels": 16},
-        "bev": {"rows": 24, "columns": 48, "widths": (16, 24, 32)},
-        "decoder": {"queries": 12, "points": 20, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
-        "temporal_bev": {"channels": 8},
-        "masks": {"channels": 16},
-        "future": {"hidden": 32},
-    }
-    base = preset("lite").model_dump()
-    for section, values in changes.items():
-        base[section] |= values
-    return PredMapNetConfig.model_validate(base)
+    return small_config(
+        "lite",
+        image={"width": 128, "height": 48},
+        bev={
+            "rows": 24,
+            "columns": 48,
+            "backbone": {"stem": (8, 16), "widths": (16, 16, 24), "channels": 16},
+            "memory": {"channels": 8, "capacity": 8},
+        },
+        decoder={"queries": 12, "points": 20},
+    )
 
 
 def painted_scene(folder: Path, frames: int, seed: int, config: PredMapNetConfig, rig: Rig = DEMO_RIG) -> CachedScene:

@@ -9,8 +9,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from mapfusion.elements import ElementKind
 from predmapnet.config import PredMapNetConfig
@@ -22,7 +21,7 @@ from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.instants import StageTraining
 from predmapnet.training.settings import NUSCENES_STAGES, Stage
-from tests.predmapnet.network.small_baseline import frames, small_config
+from tests.predmapnet.small_networks import PlainBackbone, frames, small_config
 
 BEV, WARMUP, JOINT = NUSCENES_STAGES
 GRID = (100, 200)
@@ -44,18 +43,6 @@ class Watched(PredMapNet):
         return self.states[-1]
 
 
-class PlainBackbone(nn.Module):
-    """One convolution in place of a ResNet-50, at the same strides."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.convolution = nn.Conv2d(3, channels, 8, stride=8)
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        fine = torch.relu(self.convolution(images / 30.0))
-        return [fine, functional.avg_pool2d(fine, 2), functional.avg_pool2d(fine, 4, ceil_mode=True)]
-
-
 def clip_network(**sections: dict[str, object]) -> Watched:
     """Return a network in training mode whose zero-started branches are open."""
     calm = {"bev": {"dropout": 0.0}, "decoder": {"dropout": 0.0, "points": 20}}
@@ -68,7 +55,7 @@ def clip_network(**sections: dict[str, object]) -> Watched:
 def _built(text: str) -> Watched:
     torch.manual_seed(0)
     network = Watched(parse_config(text, "test"))
-    network.image_backbone = PlainBackbone(network.config.backbone.channels)
+    network.image_backbone = PlainBackbone(network.config.bev.width)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             if not parameter.any() or name.endswith("offsets.weight"):

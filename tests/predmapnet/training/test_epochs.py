@@ -1,6 +1,6 @@
 """Epochs: everything comes as often as it should, in an order that hangs on nothing but seed and number."""
 
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -106,7 +106,7 @@ def test_streams_go_on_from_step_to_step_and_can_begin_at_any(scenes, tmp_path):
     exact = AugmentationSettings(pose_metres=0.0, pose_degrees=0.0)
     streams = Streams(scenes, store, settings, exact, (0, 2))
     steps = [streams[step] for step in range(14)]
-    for before, after in zip(steps, steps[1:], strict=False):
+    for before, after in pairwise(steps):
         last, first = (each.features[which].levels[0][:, 0, 0, 0] for each, which in ((before, 1), (after, 0)))
         for stream in range(2):
             if not after.fresh[stream]:

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.network.calibration import collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.presets import preset
 from predmapnet.training.data.batches import Batch
 from predmapnet.training.data.targets import truth_targets
+from tests.predmapnet.small_networks import small_config
 from tests.predmapnet.training.painted_scenes import painted_scene
 
 GRID = (100, 200)
@@ -20,18 +21,12 @@ GRID = (100, 200)
 
 def tiny_paper_config() -> PredMapNetConfig:
     """All parts of ``paper-nuscenes``; the image backbone is as deep, the rest narrow."""
-    changes = {
-        "image": {"width": 96, "height": 64},
-        "backbone": {"channels": 32},
-        "bev": {"rows": 12, "columns": 24, "width": 32, "heads": 4, "hidden": 32},
-        "masks": {"channels": 16},
-        "future": {"hidden": 32},
-        "decoder": {"queries": 12, "width": 32, "heads": 4, "layers": 2, "hidden": 32},
-    }
-    base = preset("paper-nuscenes").model_dump()
-    for section, values in changes.items():
-        base[section] |= values
-    return PredMapNetConfig.model_validate(base)
+    return small_config(
+        "paper-nuscenes",
+        bev={"rows": 12, "columns": 24, "cameras": NUSCENES_CAMERAS, "memory": {"capacity": 20}},
+        decoder={"points": 20, "memory_capacity": 20},
+        tracking={"tau_t": 0.5, "first_tau_d": None, "tau_d": 0.4},
+    )
 
 
 def tiny_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:

@@ -1,7 +1,9 @@
-"""MapTracker's baseline at a size for tests, two cameras, and frames for them."""
+"""The networks of all tests: presets at small sizes, weights that are nowhere zero, and frames for them."""
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+from torch.nn import functional
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.calibration import Calibration, collate_calibrations
@@ -10,12 +12,31 @@ from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
 from predmapnet.presets import preset
 
+LITE = {
+    "image": {"width": 64, "height": 24},
+    "bev": {
+        "rows": 26,
+        "columns": 52,
+        "widths": (16, 24, 32),
+        "backbone": {"stem": (8, 8), "widths": (8, 8, 16), "blocks": (1, 1, 1), "channels": 8},
+        "memory": {"channels": 4, "capacity": 5},
+    },
+    "masks": {"channels": 16},
+    "decoder": {"queries": 8, "points": 6, "width": 32, "heads": 4, "layers": 2, "point_width": 16},
+    "future": {"hidden": 32},
+}
 SIZE = (64, 96)
-SECTIONS = {
+MAPTRACKER = {
     "image": {"height": SIZE[0], "width": SIZE[1]},
-    "backbone": {"channels": 32},
-    "bev": {"rows": 10, "columns": 20, "width": 32, "heads": 4, "hidden": 32, "cameras": ("front", "back")},
-    "temporal_bev": {"capacity": 6},
+    "bev": {
+        "rows": 10,
+        "columns": 20,
+        "width": 32,
+        "heads": 4,
+        "hidden": 32,
+        "cameras": ("front", "back"),
+        "memory": {"capacity": 6},
+    },
     "masks": {"channels": 16},
     "future": {"hidden": 32},
     "decoder": {
@@ -35,10 +56,18 @@ SECTIONS = {
 def small_config(name: str = "maptracker-nuscenes", **sections: dict[str, object]) -> PredMapNetConfig:
     """Return a preset with small sizes; keyword arguments change sections further."""
     values = preset(name).model_dump()
-    for changes in (SECTIONS, sections):
-        for section, change in changes.items():
-            values[section] = change if "kind" in change else {**values[section], **change}
+    for changes in (LITE if name == "lite" else MAPTRACKER, sections):
+        values = changed(values, changes)
     return PredMapNetConfig.model_validate(values)
+
+
+def changed(values: dict[str, object], changes: dict[str, object]) -> dict[str, object]:
+    """Change some of the values, in sections as well; a section of a kind of its own takes the place of another."""
+    new = {
+        name: changed(values[name], value) if isinstance(value, dict) and "kind" not in value else value
+        for name, value in changes.items()
+    }
+    return {**values, **new}
 
 
 def small_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
@@ -54,6 +83,28 @@ def small_network(config: PredMapNetConfig, seed: int = 0) -> PredMapNet:
             elif name.endswith("offsets.weight"):
                 parameter.add_(0.05 * torch.randn_like(parameter))
     return network
+
+
+class PlainBackbone(nn.Module):
+    """One convolution in place of a ResNet-50, at the same strides."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(3, channels, 8, stride=8)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        fine = torch.relu(self.convolution(images / 30.0))
+        return [fine, functional.avg_pool2d(fine, 2), functional.avg_pool2d(fine, 4, ceil_mode=True)]
+
+
+def opened(module: nn.Module, seed: int = 0) -> nn.Module:
+    """Give branches and biases that begin as zero the weights that training would, and switch to evaluation."""
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            if not parameter.any():
+                parameter.normal_(0, 0.3, generator=generator)
+    return module.eval()
 
 
 def two_cameras() -> Calibration:
