@@ -5,10 +5,8 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
-import signal
 import sys
 import threading
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -104,23 +102,6 @@ def workers_that_fit(device: str) -> int:
         return 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return max(1, min(available_cores() - 1, memory // WORKER_MEMORY))
-
-
-def begin_worker(threads: int) -> None:
-    """Prepare a worker process: CPU threads, an end with its parent, and Ctrl-C left to the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    use_threads(threads)
-
-
-def stop_workers(pool: ProcessPoolExecutor) -> None:
-    """End all processes of a pool at once, whatever they are doing."""
-    workers = list((getattr(pool, "_processes", None) or {}).values())
-    for worker in workers:
-        worker.kill()
-    for worker in workers:
-        worker.join()
-    pool.shutdown(wait=False, cancel_futures=True)
 
 
 def end_with_parent() -> None:
