@@ -6,6 +6,7 @@ on with the same frames, and two processes see what one would have seen with the
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -19,7 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 from mapfusion.arrays import Float
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.machine import begin_worker
+from predmapnet.machine import end_with_parent, use_threads
 from predmapnet.training.data.augmentation import AugmentationSettings, augment, mirror
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
@@ -171,6 +172,8 @@ def step_loader(
     )
 
 
-def begin_loading(_worker: int) -> None:
-    """Prepare a process that loads."""
-    begin_worker(1)
+def begin_loading(_worker: int = 0) -> None:
+    """Prepare a process that loads: one thread, an end with its parent, and Ctrl-C left to that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    use_threads(1)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from functools import partial
 from hashlib import sha256
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,11 +20,11 @@ from predmapnet.datasets.images import read_image
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.demo_world.training_drive import training_drive
 from predmapnet.errors import UserError
-from predmapnet.machine import begin_worker, stop_workers
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import stack_windows, window_camera
 from predmapnet.scenes import Frame, FrameTruth, Image, Scene, SceneSource
 from predmapnet.training.data.depth_targets import depth_of_frame
+from predmapnet.training.data.draws import begin_loading
 from predmapnet.training.data.scene_cache import (
     INDEX,
     JPEG_OPTIONS,
@@ -189,14 +189,18 @@ def fill_with_demo(
     if not missing:
         return
     report(f"Drawing {len(missing)} of {len(names)} demo scenes for training into {folder}.")
-    pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=begin_worker, initargs=(1,))
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), initializer=begin_loading)
     try:
         jobs = {pool.submit(cache_demo_scene, folder / name, config): name for name in missing}
         for done, job in enumerate(as_completed(jobs), start=1):
             job.result()
             report(f"{done}/{len(missing)} {jobs[job]}")
+    except BaseException:
+        for process in list((getattr(pool, "_processes", None) or {}).values()):
+            process.kill()  # It would finish its scene first.
+        raise
     finally:
-        stop_workers(pool)
+        pool.shutdown(cancel_futures=True)
 
 
 def _is_whole(folder: Path) -> bool:
