@@ -7,6 +7,7 @@ that stands in the :class:`~predmapnet.training.settings.Stage`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,7 +78,7 @@ class StageTraining(nn.Module):
         self.low_precision = self.save_memory = False
         size = torch.tensor([network.config.roi_length, network.config.roi_width])
         self.register_buffer("_size", size, persistent=False)
-        self.register_buffer("_unit", size if stage.losses.metres else torch.ones(2), persistent=False)
+        self.register_buffer("_unit", size.clone() if stage.losses.metres else torch.ones(2), persistent=False)
         network.requires_grad_(True)
         for part in stage.frozen:
             if (module := getattr(network, part)) is not None:
@@ -165,7 +166,7 @@ class StageTraining(nn.Module):
     ) -> BevFeatures:
         """From images to BEV features, in low precision and with little memory where asked for; adds L_depth."""
         network = self.network
-        low = torch.autocast(network.device.type, torch.bfloat16, enabled=self.low_precision)
+        low = torch.autocast(network.device.type, torch.bfloat16) if self.low_precision else nullcontext()
 
         def lean(part: Callable[..., Any], *arguments: object) -> Any:
             return checkpoint(part, *arguments, use_reentrant=False) if self.save_memory else part(*arguments)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional
 
 from predmapnet.config import BevFormerConfig, DepthConfig, PredMapNetConfig
 from predmapnet.network.image_input import input_size, window_camera
@@ -70,16 +68,3 @@ def _of_camera(points: Float, camera: Camera, stride: int, config: DepthConfig) 
     targets = np.full((-(-camera.height // stride), -(-camera.width // stride)), UNKNOWN)
     targets[cells[far_to_near, 1], cells[far_to_near, 0]] = bins[far_to_near]
     return targets
-
-
-def depth_loss(logits: Tensor, targets: Tensor) -> Tensor:
-    """Binary cross-entropy of all bins' probabilities (a softmax), summed over bins, mean over the known cells.
-
-    Args:
-        logits: ``(..., D, h', w')``.
-        targets: ``(..., h', w') int64``, as of :func:`depth_targets`.
-    """
-    known = targets != UNKNOWN
-    wanted = functional.one_hot(targets.clamp(min=0), logits.shape[-3]).to(logits.dtype)
-    entropy = functional.binary_cross_entropy(logits.movedim(-3, -1).softmax(dim=-1), wanted, reduction="none")
-    return (entropy.sum(dim=-1) * known).sum() / known.sum().clamp(min=1)

@@ -43,7 +43,7 @@ def tiny_network(name: str) -> PredMapNet:
     torch.manual_seed(0)
     network = PredMapNet(config)
     if name not in ("single", "temporal"):
-        network.image_backbone = PlainBackbone(config.backbone.channels)
+        network.image_backbone = PlainBackbone(config.bev.width)
         torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
     with torch.no_grad():
         for parameter in network.parameters():

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from predmapnet.config import DepthConfig
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.training.data.depth_targets import UNKNOWN, depth_loss, depth_targets
+from predmapnet.training.data.depth_targets import UNKNOWN, depth_targets
+from predmapnet.training.losses.terms import depth_loss
 from tests.predmapnet.network.maptracker_reference import FOLDER
 
 BINS = DepthConfig(enabled=True, bins=20, near=2.0, far=42.0)

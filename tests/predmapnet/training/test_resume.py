@@ -57,7 +57,7 @@ def run(folder, scenes, name, resume=False, cut_at=None):
     torch.manual_seed(3)
     network = PredMapNet(scenes[name].config)
     if name == "joint":
-        network.image_backbone = PlainBackbone(network.config.backbone.channels)
+        network.image_backbone = PlainBackbone(network.config.bev.width)
         torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
     trainer = Trainer(one_process(), network, folder, OFTEN, quiet)
     if resume:

@@ -41,7 +41,7 @@ def train(fabric, name, config, scenes, folder, cut_at=None, resume=False):
     torch.manual_seed(0)
     network = PredMapNet(config)
     if name == "joint":
-        network.image_backbone = PlainBackbone(config.backbone.channels)
+        network.image_backbone = PlainBackbone(config.bev.width)
         torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
     trainer = Trainer(fabric, network, folder, replace(OFTEN, sync_norms=True), quiet)
     if resume:
