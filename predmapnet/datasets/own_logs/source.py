@@ -29,6 +29,7 @@ class LogSource:
         root: a log, or a folder of logs, or a folder with train, val and test folders of logs.
         synthetic: False.
         rate: frames a second at most.
+        folders: of the logs, by name.
     """
 
     name = "log"
@@ -38,8 +39,8 @@ class LogSource:
         """Find the logs. Raises UserError: there is none."""
         self.root = Path(root)
         self.rate = rate
-        self._logs = find_own_logs(self.root)
-        if not self._logs:
+        self.folders = find_own_logs(self.root)
+        if not self.folders:
             raise UserError(
                 f"{self.root} holds no log: looked for {CALIBRATION} in it, in its folders, and in the folders of "
                 "train, val and test. docs/own-logs.md has the layout."
@@ -48,7 +49,7 @@ class LogSource:
     def scenes(self, split: str | None = None) -> tuple[SceneInfo, ...]:
         """List the logs, sorted by name; one outside of a folder train or val is ``test``. Broken ones say why."""
         check_split(split)
-        return tuple(self._info(name) for name in self._logs if split in (None, self._split(name)))
+        return tuple(self._info(name) for name in self.folders if split in (None, self._split(name)))
 
     def _info(self, name: str) -> SceneInfo:
         try:
@@ -57,18 +58,18 @@ class LogSource:
             return SceneInfo(name, self._split(name), 0, "", ready=False, description=str(error))
 
     def _split(self, name: str) -> str:
-        folder = self._logs[name].parent.name
-        return folder if folder in SPLITS and self._logs[name] != self.root else "test"
+        folder = self.folders[name].parent.name
+        return folder if folder in SPLITS and self.folders[name] != self.root else "test"
 
     def open(self, scene: str, progress: Progress | None = None) -> LogScene:
         """Open one log by its name. Raises UserError with the nearest names if it is not there."""
-        if scene not in self._logs:
-            near = difflib.get_close_matches(scene, list(self._logs), n=4, cutoff=0.3)
+        if scene not in self.folders:
+            near = difflib.get_close_matches(scene, list(self.folders), n=4, cutoff=0.3)
             hint = f" Did you mean {', '.join(near)}?" if near else ""
-            raise UserError(f"{self.root} holds no log '{scene}' among its {len(self._logs)} logs.{hint}")
-        return LogScene(self._logs[scene], self.rate, self._split(scene))
+            raise UserError(f"{self.root} holds no log '{scene}' among its {len(self.folders)} logs.{hint}")
+        return LogScene(self.folders[scene], self.rate, self._split(scene))
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which logs frames (``<log>_<timestamp>``) belong to; unknown tokens are absent."""
         found = {token: token.rpartition("_")[0] for token in tokens}
-        return {token: log for token, log in found.items() if log in self._logs}
+        return {token: log for token, log in found.items() if log in self.folders}

@@ -59,6 +59,13 @@ class TimedPoses:
         return np.asarray(inside & (self.timestamps[after] - self.timestamps[after - 1] <= LONGEST_GAP))
 
 
+def rows_apart(positions: Float, metres: float) -> Integer:
+    """Return rows of positions ``(n, d)`` along a way that are about so many metres apart, the first one among them."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
+    rows = np.searchsorted(way, np.arange(0.0, max(float(way[-1]), metres), metres))
+    return np.unique(np.minimum(rows, len(way) - 1))
+
+
 def write_timed_poses(path: Path, poses: TimedPoses) -> None:
     """Write ``poses.csv``; raises UserError if that fails."""
     with write_file(path) as draft:

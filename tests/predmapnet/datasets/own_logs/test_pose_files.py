@@ -1,6 +1,7 @@
 """Poses of a drive: between instants, and from files in the layouts of CSV, TUM and KITTI."""
 
 import csv
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.own_logs.pose_files import read_timed_poses
-from predmapnet.datasets.own_logs.timed_poses import FARTHEST_BEYOND, LONGEST_GAP, TimedPoses, write_timed_poses
+from predmapnet.datasets.own_logs.timed_poses import (
+    FARTHEST_BEYOND,
+    LONGEST_GAP,
+    TimedPoses,
+    rows_apart,
+    write_timed_poses,
+)
 from predmapnet.errors import UserError
 
 START = 1_500_000_000_000_000_000
@@ -169,6 +176,28 @@ def test_text_files_that_are_neither_are_refused(tmp_path):
         read_timed_poses(tmp_path)
     write_timed_poses(tmp_path / "poses.csv", curve())
     with pytest.raises(UserError, match=r"poses\.csv and poses\.txt"):
+        read_timed_poses(tmp_path)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=30), st.floats(0.1, 3.0))
+def test_rows_are_thinned_along_the_way(steps, metres):
+    way = np.cumsum(steps)
+    rows = rows_apart(way[:, None], metres)
+    assert rows[0] == 0 and (np.diff(rows) > 0).all() and rows[-1] < len(way)
+    # No stretch of the way goes unseen: from a row to the next, only its own step may be longer.
+    assert all(way[later - 1] - way[row] <= metres for row, later in pairwise([*rows.tolist(), len(way)]))
+
+
+def test_a_wrong_order_is_told_of_poses_in_close_succession_too(tmp_path):
+    seconds = 0.005 * np.arange(1000)
+    poses = np.tile(np.eye(4), (1000, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", 0.3 * seconds[:, None]).as_matrix()
+    poses[:, 0, 3], poses[:, 1, 3] = 20 * np.sin(0.3 * seconds), 20 * (1 - np.cos(0.3 * seconds))
+    write_timed_poses(tmp_path / "poses.csv", TimedPoses(START + np.round(seconds * 1e9).astype(np.int64), poses))
+    read_timed_poses(tmp_path)
+    rewritten(tmp_path / "poses.csv", swap_order)
+    with pytest.raises(UserError, match="x, y, z, w"):
         read_timed_poses(tmp_path)
 
 
