@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import predmapnet
 from mapfusion.elements import ElementKind
-from mapfusion.formats.by_suffix import SUFFIXES
+from mapfusion.formats.by_suffix import SUFFIXES, map_suffix
 from mapfusion.ground import coverage
 from predmapnet.errors import UserError
 from predmapnet.files import file_name
@@ -84,17 +84,16 @@ def folder_report(folder: OutputFolder, out_beside: bool = True) -> str:
     names = folder.names()
     outcomes = list(outcomes_in(folder))
     of_scene = {file_name(outcome.scene): outcome.scene for outcome in outcomes}
-    endings = set(SUFFIXES) - {".json"}
-    maps = sorted(name for name in names if PurePosixPath(name).suffix.lower() in endings and name[0] != ".")
+    maps = _one_of_each(names)
     if not maps and not outcomes:
         raise UserError(f"there is neither a map nor a record of a batch in {folder.where}")
     with tempfile.TemporaryDirectory(prefix="predmapnet-") as temporary:
         paths = []
-        for name in maps:
+        for stem, name in maps.items():
             path = Path(temporary) / name if folder.path is None else folder.path / name
-            paths.append((of_scene.get(path.stem, path.stem), path))
+            paths.append((of_scene.get(stem, stem), path))
         if folder.path is None:
-            for name, content in folder.read(maps):
+            for name, content in folder.read(maps.values()):
                 (Path(temporary) / name).write_bytes(content)
         drawn = _drawn(paths)
     known = {outcome.scene for outcome in outcomes}
@@ -102,6 +101,16 @@ def folder_report(folder: OutputFolder, out_beside: bool = True) -> str:
     where = "" if out_beside else folder.link("") if folder.path is None else f"{folder.path}/"
     title = f"Maps in {PurePosixPath(folder.where.rstrip('/')).name or folder.where}"
     return page(title, _parts(folder.where, sorted(outcomes, key=lambda found: found.scene), drawn, names, where))
+
+
+def _one_of_each(names: set[str]) -> dict[str, str]:
+    """Return the map files by their names without the ending; of several formats the first by name, as good as any."""
+    found: dict[str, str] = {}
+    for name in sorted(names):
+        suffix = map_suffix(Path(name))
+        if suffix not in (None, ".json") and name[0] != ".":
+            found.setdefault(name[: -len(suffix or "")], name)
+    return found
 
 
 def map_report(path: Path) -> str:

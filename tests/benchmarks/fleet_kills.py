@@ -2,9 +2,9 @@
 
     python -m tests.benchmarks.fleet_kills [--scenes 24]
 
-A worker, a node and the driver are killed on the way; two scenes have a damaged image, one never ends. In the end every
-other map must equal that of ``infer`` byte for byte but for its time stamp, the failure table must hold exactly those
-three, and no scene may have been mapped again after it was done.
+It takes Linux and root. A worker, a node and the driver are killed on the way; two scenes have a damaged image, one
+never ends. In the end every other map must equal that of ``infer`` byte for byte but for its time stamp, the failure
+table must hold exactly those three, and no scene may have been mapped again after it was done.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from tests.cli.tiny_nuscenes import image_path, write_tiny_nuscenes
 T = TypeVar("T")
 BROKEN = ("scene-0003", "scene-0011")
 HANGING = "scene-9999"
+ENDLESS = Path("/proc/kmsg")
+"""A regular file that root may read, and whose reader waits for what the kernel will say next."""
 
 
 def without_time(path: Path) -> bytes:
@@ -36,7 +38,7 @@ def without_time(path: Path) -> bytes:
 
 
 def write_data(root: Path, count: int) -> Path:
-    """Write the scenes and their manifest; a table of the hanging one is a pipe that nobody writes to."""
+    """Write the scenes and their manifest; a table of the hanging one has no end."""
     names = tuple(f"scene-{number:04d}" for number in range(count - 1))
     data = write_tiny_nuscenes(root / "data", names, frames=3)
     for name in BROKEN:
@@ -44,7 +46,7 @@ def write_data(root: Path, count: int) -> Path:
         path.write_bytes(path.read_bytes()[:900])
     hanging = write_tiny_nuscenes(root / "hanging", (HANGING,), frames=1)
     (hanging / "v1.0-mini" / "ego_pose.json").unlink()
-    os.mkfifo(hanging / "v1.0-mini" / "ego_pose.json")
+    (hanging / "v1.0-mini" / "ego_pose.json").symlink_to(ENDLESS)
     lines = [*(f"{name},data" for name in names), f"{HANGING},hanging"]
     (root / "list.csv").write_text("\n".join(["scene,folder", lines[-1], *lines[:-1]]) + "\n")
     return root / "list.csv"

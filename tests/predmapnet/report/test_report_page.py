@@ -129,6 +129,16 @@ def test_the_page_needs_nothing_from_elsewhere_and_names_every_failure(folder):
     assert 'href="/' in folder_report(folder, out_beside=False)
 
 
+def test_a_scene_is_drawn_once_whatever_formats_lie_there(folder, tmp_path):
+    write_map(GlobalMap((line(),)), tmp_path / "scene-1.gpkg", PLANE)
+    write_map(GlobalMap((line(50.0),)), tmp_path / "scene-2.gpkg", PLANE)
+    (tmp_path / "other.json").write_text("{}")
+    html = folder_report(folder)
+    data = json.loads(re.search(r'id="city-data">(.*?)</script>', html, re.DOTALL)[1])
+    assert data["rows"] == ["scene-1", "scene-2"]
+    assert "cannot be drawn" not in html
+
+
 def test_one_map_and_a_folder_without_any(folder, tmp_path):
     assert 'id="city-data"' in map_report(tmp_path / "scene-1.geojson")
     (tmp_path / "empty").mkdir()
