@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, MapElement
 from mapfusion.formats.argoverse2_archive import read_argoverse2, write_argoverse2
+from mapfusion.formats.foreign_values import json_of
 from mapfusion.formats.geodatabase import write_geodatabase
 from mapfusion.formats.geodatabase_reader import geodatabase_box, read_geodatabase
 from mapfusion.formats.geojson import GeoJsonWriter, read_geojson, write_geojson
@@ -239,7 +239,7 @@ def read_box(path: Path) -> Float | None:
             with path.open(encoding="utf-8-sig", errors="replace") as file:
                 head = file.read(512)
             found = re.match(r'\s*\{"type":"FeatureCollection","bbox":(\[[^]]*\])', head)
-            box = json.loads(found[1]) if found else _box_of_points(path)
+            box = (json_of(found[1]) if found else None) or _box_of_points(path)
         case _:
             box = _box_of_points(path)
     if box is None:

@@ -95,7 +95,7 @@ def _read_layer(plain: Path, path: Path, layer: str) -> tuple[list[tuple[float, 
     columns = dict(zip(meta["fields"].tolist(), values, strict=True))
     for name in TIMES:
         rest = columns.pop(f"{name}{REST}", None)
-        if rest is not None and columns[name].dtype.kind == "M":
+        if rest is not None and name in columns and columns[name].dtype.kind == "M":
             columns[name] = columns[name].astype("datetime64[ns]") + np.nan_to_num(rest).astype("timedelta64[ns]")
     numbers = columns.pop("number", np.full(len(geometry), np.nan))
     rows = []

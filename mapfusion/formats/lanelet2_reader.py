@@ -132,7 +132,8 @@ def _joined(right: list[tuple[float, ...]], left: list[tuple[float, ...]]) -> li
 
 
 def _is_simple(ring: list[tuple[float, ...]]) -> bool:
-    return len(ring) >= 4 and bool(shapely.Polygon([position[:2] for position in ring]).is_valid)
+    corners = np.array([position[:2] for position in ring])
+    return len(ring) >= 4 and bool(np.isfinite(corners).all()) and bool(shapely.Polygon(corners).is_valid)
 
 
 def _deleted(thing: ElementTree.Element) -> bool:

@@ -132,6 +132,16 @@ def test_observed_ground_is_a_layer_and_what_is_drawn_there_counts(tmp_path):
     )
 
 
+def test_a_column_that_a_person_renamed_is_supplied(tmp_path):
+    write_map(EXAMPLE, tmp_path / "map.gpkg", PLANE)
+    with sqlite3.connect(tmp_path / "map.gpkg") as database:
+        database.execute("ALTER TABLE lines RENAME COLUMN first_seen TO seen")
+    database.close()
+    found = read_map(tmp_path / "map.gpkg")
+    assert len(found) == 3
+    assert any("without confidence, observations or times" in note for note in found.notes)
+
+
 def test_styles_are_inside_the_geopackage(tmp_path):
     write_map(EXAMPLE, tmp_path / "map.gpkg", PLANE)
     with sqlite3.connect(tmp_path / "map.gpkg") as database:

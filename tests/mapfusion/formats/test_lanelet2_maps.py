@@ -141,6 +141,17 @@ def test_a_crossing_drawn_by_hand_with_sides_against_each_other_is_a_ring(tmp_pa
     assert shapely.Polygon(found.points).area == pytest.approx(40.0, rel=1e-3)
 
 
+def test_a_corner_of_a_crossing_that_is_nowhere_is_named(written):
+    def lose(root):
+        node = root.find("relation/member").attrib["ref"]
+        way = next(way for way in root.iter("way") if way.attrib["id"] == node)
+        corner = way.find("nd").attrib["ref"]
+        next(node for node in root.iter("node") if node.attrib["id"] == corner).set("lat", "nan")
+
+    with pytest.raises(ValueError, match=r"map\.osm: feature 3"):
+        edit(written, lose)
+
+
 def test_paint_set_in_josm_is_taken(written):
     def repaint(root):
         way = list(root.iter("way"))[3]
