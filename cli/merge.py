@@ -38,18 +38,22 @@ def merge(
     """
     from cli.console import counted, elements_table, print_json, progress_display, say_warning
     from cli.console import out as screen
-    from mapfusion.formats.by_suffix import check_crs, check_suffix
+    from mapfusion.formats.by_suffix import check_crs, check_suffix, maps_in
     from mapfusion.formats.qgis_style import write_styles
     from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
     from predmapnet import __version__
-    from predmapnet.errors import value_errors_told
+    from predmapnet.errors import UserError, value_errors_told
     from predmapnet.files import check_output
 
     with value_errors_told():
         check_suffix(out)
         check_crs(out, crs)
-    paths = _files(maps, out)
+        paths = [file for path in maps for file in (maps_in(path) if path.is_dir() else [path])]
+    # A city map among the drives' is the result of the last time.
+    paths = [path for path in paths if path in maps or path.absolute() != out.absolute()]
+    if not paths:
+        raise UserError(f"the only map there is {out} itself")
     check_output(out, (), paths, force)
     config, told = MergeConfig(tile=tile), {"version": __version__}
     with (
@@ -76,28 +80,6 @@ def merge(
         say_warning(f"{name}: {note}")
     for name in report.duplicates:
         say_warning(f"{name} is the same as another map and counts once")
-
-
-def _files(maps: list[Path], out: Path) -> list[Path]:
-    from mapfusion.formats.by_suffix import SUFFIXES, map_suffix
-    from predmapnet.errors import UserError
-
-    paths: list[Path] = []
-    for path in maps:
-        if not path.is_dir():
-            paths.append(path)
-            continue
-        inside = [
-            file
-            for file in sorted(path.rglob("*"))
-            if map_suffix(file) not in (None, ".json")  # summaries and other things are JSON, too
-            and not file.name.startswith(".")
-            and file.absolute() != out.absolute()
-        ]
-        if not inside:
-            raise UserError(f"there is no map in the folder {path}; maps end in {', '.join(SUFFIXES)}")
-        paths.extend(inside)
-    return paths
 
 
 def _alignment_sentence(report: MergeReport) -> str:

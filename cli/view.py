@@ -1,4 +1,4 @@
-"""``predmapnet view``: look at a scene while it is mapped, at a recording, or at a map."""
+"""``predmapnet view``: look at a scene while it is mapped, at a recording, at maps, or at what changed."""
 
 from __future__ import annotations
 
@@ -23,16 +23,25 @@ from predmapnet.machine import NetworkOptions, Precision, use_threads
 
 def view(
     what: Annotated[
-        str,
+        list[str],
         typer.Argument(
-            help="A scene or the folder of a log (mapped now), a recording (.rrd) or a map (.geojson, .gpkg, .fgb "
-            "or .osm)."
+            metavar="WHAT",
+            help="A scene or the folder of a log (mapped now), a recording (.rrd), a map of any format or a folder of "
+            "maps; or two maps, older first: what changed.",
         ),
     ],
     web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
-    port: Annotated[int, typer.Option(help="Port of the web viewer.")] = 9090,
+    port: Annotated[
+        int, typer.Option(min=1, max=65534, help="Port of the web viewer; its data take the next one.")
+    ] = 9090,
+    bind: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0 lets everyone on the network look.")
+    ] = "127.0.0.1",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Write a recording (.rrd) instead of opening a viewer.")
+    ] = None,
+    track: Annotated[
+        int | None, typer.Option(help="Show the memory of this track. Default: a confident one.", show_default=False)
     ] = None,
     dataset: Dataset = None,
     data_root: DataRoot = None,
@@ -44,39 +53,72 @@ def view(
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
 ) -> None:
-    """Open a scene (live, while it is mapped), a recording or a map in Rerun.
+    """Look at scenes, recordings and maps in Rerun.
 
     Without a display, a recording is written instead, and the command prints how to open it.
     """
-    from cli.console import err, progress_display, say_report, warn_of_weights
-    from cli.viewer import Viewer
-    from mapfusion.formats.by_suffix import SUFFIXES
+    from cli.console import err, progress_display, say_report, say_warning, warn_of_weights
+    from cli.viewer import WebOptions, open_viewer, show_file
+    from predmapnet.errors import value_errors_told
+    from predmapnet.files import check_output
     from predmapnet.runs.outputs import Outputs
     from predmapnet.sources import folder_named
 
-    ending = Path(what).suffix.lower()
-    if ending == ".rrd":
-        Viewer.show_file(Path(what), web, port)
+    browser = WebOptions(bind, port) if web else None
+    if out is not None:
+        check_output(out, (".rrd",), [Path(one) for one in what])
+    name = Path(what[0]).resolve().stem
+    if what[0].lower().endswith(".rrd") and len(what) == 1:
+        show_file(Path(what[0]), browser)
         return
-    name: str | None = what
-    if (folder := folder_named(what, dataset)) is not None:
-        name, (dataset, data_root) = None, folder
-    is_map = name is not None and ending in SUFFIXES
-    with Viewer.open(Path(what).resolve().stem, web, port, out, live=not is_map) as viewer:
-        if is_map:
-            from predmapnet.recording import log_map_file
+    folder = folder_named(what[0], dataset) if len(what) == 1 else None
+    if folder is None and (maps := map_files(what)):
+        from predmapnet.recording import log_changes, log_maps
 
-            log_map_file(viewer.recording, Path(what))
-            return
-        use_threads(threads)
-        from predmapnet.runs.infer import MappingPipeline
+        with open_viewer(name, browser, out) as recording:
+            log = log_changes if len(what) == 2 == len(maps) else log_maps
+            with value_errors_told():
+                notes = log(recording, maps)
+            for note in notes:
+                say_warning(note)
+        return
+    use_threads(threads)
+    from predmapnet.runs.infer import MappingPipeline
 
-        network = NetworkOptions(weights, device, precision, compiled)
-        pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, rate=rate)
-        err.print(pipeline.sentence, markup=False)
-        warn_of_weights(pipeline)
+    dataset, data_root = folder or (dataset, data_root)
+    network = NetworkOptions(weights, device, precision, compiled)
+    pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, rate=rate)
+    err.print(pipeline.sentence, markup=False)
+    warn_of_weights(pipeline)
+    with open_viewer(name, browser, out, live=True) as recording:
         with progress_display() as display:
             mapped = pipeline.run(
-                name, Outputs(), preparing=display.preparing, progress=display.frames, viewer=viewer.recording
+                None if folder else what[0],
+                Outputs(),
+                preparing=display.preparing,
+                progress=display.frames,
+                viewer=recording,
+                track=track,
             )
         say_report(mapped.report)
+
+
+def map_files(named: list[str]) -> list[Path]:
+    """Return the maps that are named, and those in folders that are named; empty if a single scene is.
+
+    Raises:
+        UserError: there is no map in a folder, or of several names one is no map.
+    """
+    from mapfusion.formats.by_suffix import map_suffix, maps_in
+    from predmapnet.errors import UserError, value_errors_told
+
+    found: list[Path] = []
+    for path in map(Path, named):
+        if path.is_dir():
+            with value_errors_told():
+                found.extend(maps_in(path))
+        elif map_suffix(path) is not None:
+            found.append(path)
+        elif len(named) > 1:
+            raise UserError(f"{path} is no map; several things can be looked at only if they are maps or their folders")
+    return found

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mapfusion.files
-from mapfusion.formats.by_suffix import SUFFIXES
+from mapfusion.formats.by_suffix import map_suffix
 from mapfusion.formats.seal import edited_since_written
 from predmapnet.errors import UserError
 
@@ -54,7 +54,7 @@ def _check_loss(path: Path, inputs: Sequence[Path], force: bool) -> None:
     """Raise UserError if writing to a file that exists would lose what nobody can make again."""
     if any(given.exists() and given.samefile(path) for given in inputs):
         raise UserError(f"cannot write {path}: it is an input, too, and would be lost; choose another name")
-    if not force and path.suffix.lower() in SUFFIXES and edited_since_written(path):
+    if not force and map_suffix(path) and edited_since_written(path):
         raise UserError(
             f"cannot write {path}: the map in it was changed after PredMapNet wrote it, by hand or by another program, "
             "and these changes would be lost. Choose another name, or add --force"

@@ -95,6 +95,16 @@ def check_crs(path: Path, crs: str | None) -> None:
     FromDegrees(crs)
 
 
+def maps_in(folder: Path) -> list[Path]:
+    """Return the maps in a folder and below it, in the order of their names; raises ValueError if there is none."""
+    # Summaries and other things are JSON, too.
+    files = (file for file in sorted(folder.rglob("*")) if map_suffix(file) not in (None, ".json"))
+    found = [file for file in files if not file.name.startswith(".")]
+    if not found:
+        raise ValueError(f"there is no map in the folder {folder}; maps end in {', '.join(SUFFIXES)}")
+    return found
+
+
 def write_map(
     global_map: GlobalMap,
     path: Path,

@@ -1,7 +1,7 @@
 """Recordings of runs and maps for the Rerun viewer."""
 
 from predmapnet.recording.file_sink import RecordingFile
-from predmapnet.recording.map_view import log_map_file
+from predmapnet.recording.map_view import log_changes, log_maps
 from predmapnet.recording.recorder import APPLICATION, SceneRecorder
 
-__all__ = ["APPLICATION", "RecordingFile", "SceneRecorder", "log_map_file"]
+__all__ = ["APPLICATION", "RecordingFile", "SceneRecorder", "log_changes", "log_maps"]

@@ -163,6 +163,7 @@ class MappingPipeline:
         preparing: Progress | None = None,
         progress: FrameProgress | None = None,
         viewer: rr.RecordingStream | None = None,
+        track: int | None = None,
     ) -> MappedScene:
         """Map one scene and write the outputs; each file appears whole or not at all.
 
@@ -172,6 +173,7 @@ class MappingPipeline:
             preparing: called while the scene is prepared.
             progress: called after each frame.
             viewer: a Rerun stream to log into while mapping.
+            track: id of the track whose memory recordings show; None picks a confident one.
 
         Raises:
             UserError: unknown scene, broken data, or a file that cannot be written.
@@ -190,12 +192,13 @@ class MappingPipeline:
             provenance[LOCAL_FRAME] = georeference.frame
         with ExitStack() as files:
             recorders: list[SceneRecorder] = []
+            place = None if self.source.synthetic or LOCAL_FRAME in provenance else georeference
             if viewer is not None:
-                recorders.append(SceneRecorder(viewer, describe(provenance), live=True))
+                recorders.append(SceneRecorder(viewer, describe(provenance), True, place, track))
             if outputs.recording is not None:
                 recording = rr.RecordingStream(APPLICATION, recording_id=f"{self.source.name}-{scene_name}")
                 files.enter_context(RecordingFile(recording, outputs.recording))
-                recorders.append(SceneRecorder(recording, describe(provenance)))
+                recorders.append(SceneRecorder(recording, describe(provenance), False, place, track))
             observers: list[Observer] = [*recorders]
             if progress is not None:
                 observers.append(_ProgressObserver(progress))
@@ -327,10 +330,10 @@ def describe(provenance: Mapping[str, Any]) -> str:
 PredMapNet {provenance["version"]} looks through the cameras at one instant after the other and draws
 pedestrian crossings (blue), lane dividers (orange) and road boundaries (green).
 
-- bright lines: tracks of this instant
-- dashes: what was forecast for this instant one frame ago
-- dark lines: the global map as it grows
-- grey: ground truth, where the data set has it
+- bright: tracks of this instant; point at one for its id, score and age
+- dashed: what was forecast for this instant one frame ago
+- dark: the map as it grows; in *The whole map* the finished one, the darker the less confident
+- grey: ground truth, in a tab beside *The whole map*; elsewhere switched on at `world/ground_truth` (panel at the left)
 
 Weights {provenance["weights_sha256"][:12]}
 """

@@ -69,6 +69,13 @@ def test_a_map_can_be_looked_at_and_a_broken_one_is_told(predmapnet, tiny_root, 
     verify = [sys.executable, "-m", "rerun", "rrd", "verify", tmp_path / "map.rrd"]
     assert subprocess.run(verify, timeout=300, capture_output=True).returncode == 0
     Path("broken.geojson").write_text("{")
+    assert predmapnet("view", "map.geojson", "--out", "map.mp4").code == 2
+    assert predmapnet("view", "map.geojson", "map.geojson", "--out", "changes.rrd").code == 0
+    Path("maps").mkdir()
+    assert "no map in the folder maps" in predmapnet("view", "maps").err
+    Path("maps/one.gpkg").write_bytes(b"")
+    assert "maps/one.gpkg" in predmapnet("view", "maps", "--out", "maps.rrd").err
+    assert "scene-0001 is no map" in predmapnet("view", "scene-0001", "map.geojson").err
     broken = predmapnet("view", "broken.geojson", "--out", "map.rrd")
     assert broken.code == 2
     assert "broken.geojson" in broken.err
