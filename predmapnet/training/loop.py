@@ -21,6 +21,7 @@ from lightning_fabric import Fabric
 from torch import Tensor
 
 from predmapnet.errors import UserError
+from predmapnet.network.kernels.low_precision import keep_places_exact
 from predmapnet.network.kernels.synced_norm import share_statistics
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
@@ -85,6 +86,8 @@ class Trainer:
         self._stored: Path | None = None
         if settings.sync_norms and fabric.world_size > 1:
             share_statistics(network)
+        if settings.low_precision:
+            keep_places_exact(network)
         folder.mkdir(parents=True, exist_ok=True)
         self._log = MetricsLog(folder, fabric.is_global_zero, report)
 

@@ -31,6 +31,25 @@ def in_precision(network: PredMapNet, precision: Precision) -> PredMapNet:
     return network
 
 
+def keep_places_exact(network: nn.Module) -> None:
+    """Let what decides about places compute in float32 where a training computes in bfloat16 (autocast)."""
+    for module in network.modules():
+        for layer in _decide_places(module):
+            layer.register_forward_pre_hook(_leave_autocast)
+            layer.register_forward_hook(_return_to_autocast, always_call=True)
+
+
+def _leave_autocast(layer: nn.Module, inputs: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    outside = torch.autocast(inputs[0].device.type, enabled=False)
+    outside.__enter__()
+    layer.__dict__["outside"] = outside
+    return tuple(value.float() for value in inputs)
+
+
+def _return_to_autocast(layer: nn.Module, _inputs: object, _output: object) -> None:
+    layer.__dict__.pop("outside").__exit__(None, None, None)
+
+
 class _LowPrecision(nn.Module):
     """A part of the network whose products are bfloat16, and whose results are float32."""
 
