@@ -63,8 +63,7 @@ def _fitted(samples: Float, corners: Float) -> Float | None:
     along = step / np.maximum(length, 1e-9)[:, None]
     away = samples[:, None] - corners
     share = (away * along).sum(axis=2) / np.maximum(length, 1e-9)
-    across = np.abs(away[..., 0] * along[:, 1] - away[..., 1] * along[:, 0])
-    nearest = np.where((share >= 0.0) & (share <= 1.0), across, np.inf).argmin(axis=1)
+    nearest = np.linalg.norm(away - np.clip(share, 0.0, 1.0)[..., None] * step, axis=2).argmin(axis=1)
     inner = (nearest[:, None] == np.arange(4)) & (np.abs(share - 0.5) <= 0.5 - ROUNDED)
     if (inner.sum(axis=0) < 3).any():
         return None

@@ -37,6 +37,8 @@ def gpu_device() -> torch.device:
         pytest.skip(f"torch {torch.__version__} cannot pretend to have a device")
     if torch._C._get_privateuse1_backend_name() != NAME:
         backend_registration._setup_privateuseone_for_python_backend(NAME)
+        # From then on, torch takes this device for the default one in every later test and asks it for its precisions.
+        vars(getattr(torch, NAME)).setdefault("get_amp_supported_dtype", lambda: [torch.bfloat16])
     return torch.device(f"{NAME}:0")
 
 

@@ -172,5 +172,5 @@ def test_cameras_that_do_not_move_are_projected_once_and_others_anew(mapper):
 def test_an_unknown_device_is_refused():
     from predmapnet.mapper import choose_device
 
-    with pytest.raises(UserError, match="device 'toaster' cannot be used"):
+    with pytest.raises(UserError, match="There is no device 'toaster'"):
         choose_device("toaster")
