@@ -15,8 +15,7 @@ from pathlib import Path
 import cv2
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-SCENE, FRAME = "scene-0103", 14
-"""What the picture of a scene shows; in that frame the car crosses a junction."""
+SCENE = "scene-0103"
 SIZE = (1400, 900)
 
 
@@ -28,25 +27,24 @@ def main() -> None:
         recording = named.recording or Path(folder) / f"{SCENE}.rrd"
         if named.recording is None:
             run("cli.main", "infer", SCENE, "--out", f"{folder}/map.geojson", "--recording", str(recording))
-        picture_of(recording, EXAMPLES / f"{SCENE}.png", FRAME)
+        picture_of(recording, EXAMPLES / f"{SCENE}.png")
 
 
 def run(module: str, *arguments: str) -> None:
     subprocess.run([sys.executable, "-m", module, *arguments], check=True)
 
 
-def picture_of(recording: Path, picture: Path, frame: int | None = None) -> None:
-    """Write a picture of a recording as it opens, or at a frame."""
+def picture_of(recording: Path, picture: Path) -> None:
+    """Write a picture of a recording as it opens."""
     viewer = [sys.executable, "-m", "rerun_cli"]
     if not os.environ.get("DISPLAY"):
         if shutil.which("xvfb-run") is None:
             sys.exit("There is no display here, and no xvfb-run: see python -m tests.benchmarks.pictures --help")
         viewer = ["xvfb-run", "-a", *viewer, "--renderer", "vulkan"]
-    when = "" if frame is None else f"#when=frame@{frame}"
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / "shot.png"
         options = ["--screenshot-to", str(shot), "--window-size", "{}x{}".format(*SIZE), "--port", "auto"]
-        subprocess.run([*viewer, f"{recording}{when}", *options], check=True, stderr=subprocess.DEVNULL)
+        subprocess.run([*viewer, str(recording), *options], check=True, stderr=subprocess.DEVNULL)
         write_small(shot, picture)
     print(f"written: {picture} ({picture.stat().st_size / 1000:.0f} kB)")
 
