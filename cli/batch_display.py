@@ -97,7 +97,7 @@ def _line(outcome: Outcome) -> str:
 
 
 def _reason(outcome: Outcome) -> str:
-    """What failed; our own errors for users need no class before them."""
+    """Return what failed in words; our own errors for users need no class before them."""
     ours = outcome.error in ("UserError", "TimeLimitError", "WorkerDiedError")
     return str(outcome.reason) if ours else f"{outcome.error}: {outcome.reason}"
 

@@ -23,7 +23,7 @@ from predmapnet.recording import APPLICATION, RecordingFile
 
 @dataclass(frozen=True)
 class WebOptions:
-    """Where a viewer is served for web browsers.
+    """Address at which a viewer is served for web browsers.
 
     Attributes:
         bind: address to listen on.

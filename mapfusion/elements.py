@@ -18,7 +18,7 @@ Origins: TypeAlias = Mapping[str, tuple[int, ...]]
 
 
 PAINTS = ("solid", "dashed")
-"""What is known of the paint of a divider."""
+"""Known paint of a divider."""
 
 
 class ElementKind(IntEnum):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 Work = Callable[[Any], Any]
-"""What a worker does with one task."""
+"""The work on one task."""
 
 Begin = Callable[[], Work]
 """Called once in each worker: opens what the work needs (a model, a cache) and returns the work. It is pickled."""

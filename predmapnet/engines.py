@@ -1,4 +1,4 @@
-"""What computes the network for a :class:`~predmapnet.mapper.Mapper`: torch here, exported graphs elsewhere."""
+"""Engines that compute the network for a :class:`~predmapnet.mapper.Mapper`: torch here, exported graphs elsewhere."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CALIBRATIONS_KEPT = 8
 """Calibrations whose geometry is remembered; cameras that never move cost it once."""
 
 EngineStep = tuple[Selection, StreamState, Tensor]
-"""What inference makes of a frame, the state of the next one, and segmentation logits ``(1, 3, H_s, W_s)``."""
+"""Result of a frame: its selection, the state for the next one, and segmentation logits ``(1, 3, H_s, W_s)``."""
 
 
 class Engine(Protocol):

@@ -28,7 +28,7 @@ class Precision(StrEnum):
 
 
 class EngineKind(StrEnum):
-    """What computes the network."""
+    """Program that computes the network."""
 
     TORCH = "torch"
     ONNX = "onnx"

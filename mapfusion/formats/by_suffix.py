@@ -63,7 +63,7 @@ _ONE_SYSTEM = {
     "Lanelet2": "its nodes have latitude and longitude",
     "OpenDRIVE": "it is projected about the origin of the map's frame",
 }
-"""Why a format has one reference system."""
+"""Reason why a format has one reference system."""
 
 
 def map_suffix(path: Path) -> str | None:

@@ -31,7 +31,7 @@ class MapStatus:
 
     @property
     def shift(self) -> float:
-        """How far it was moved, metres."""
+        """Distance by which it was moved, metres."""
         return float(np.linalg.norm(self.correction.shift))
 
 

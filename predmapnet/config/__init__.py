@@ -99,7 +99,7 @@ class PredMapNetConfig(Section):
 
     @property
     def mask_level(self) -> int:
-        """Which of the BEV levels, fine to coarse, has the cells of the masks."""
+        """Index of the BEV level, fine to coarse, that has the cells of the masks."""
         return self.bev.mask_stride - 1
 
     def to_json(self) -> str:

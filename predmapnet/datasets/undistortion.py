@@ -22,7 +22,7 @@ COEFFICIENTS = {BROWN_CONRADY: (4, 5, 8, 12, 14), KANNALA_BRANDT: (4,)}
 """Numbers of coefficients that each model may have, in OpenCV's order: k1, k2, p1, p2, k3, ... and k1, k2, k3, k4."""
 
 WIDEST = np.array([np.tan(np.radians(60.0)), np.tan(np.radians(45.0))])
-"""How far a pinhole looks to each side, and up and down, at most: as wide as networks have learned to see."""
+"""Largest angle of a pinhole to each side, and up and down: as wide as networks have learned to see."""
 MOST_PITCH = np.radians(12.0)
 """A pinhole behind a fisheye looks down by no more than this, radians, nor is it tilted to a side."""
 NARROWEST = 0.02
@@ -70,7 +70,7 @@ class Lens:
 
     @property
     def _bending(self) -> tuple[Float, Float]:
-        """How far off the axis rays enter (an angle for a fisheye, else a tangent) and leave, up to where it folds."""
+        """Distances from the axis at which rays enter (a fisheye: angle, else tangent) and leave, up to the fold."""
         fisheye = self.model == KANNALA_BRANDT
         offset = np.linspace(0.0, np.pi if fisheye else 5.0, 4097)
         bent = _angular(offset, self.distortion) if fisheye else _radial(offset, self.distortion)

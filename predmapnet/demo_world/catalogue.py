@@ -29,7 +29,7 @@ FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
 """Scenes of the first world that are kept, so that networks can be compared with older ones."""
 
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
-"""How often each look is drawn for a training scene."""
+"""Probability of each look of a training scene."""
 
 _TEN_LOOKS = (
     Look.DAY,

@@ -37,7 +37,7 @@ _POOLED = {
     "map_f1@1.0": ("global_map", "f1@1.0"),
     "global_mAP": ("global_map_ap", "mAP"),
 }
-"""Where the official figure over all scenes together stands in the file, section and key."""
+"""Section and key of the official figure over all scenes together."""
 _SAME = {
     "dataset": "data set",
     "split": "split",

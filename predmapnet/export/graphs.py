@@ -32,7 +32,7 @@ LEVELS = ("bev.fine", "bev.middle", "bev.coarse")
 DETECTIONS = ("valid", "labels", "scores", "points")
 """Of the rows that are reported beside the tracks."""
 BEV_MEMORY = ("bev_memory", "bev_memory_pose", "bev_memory_valid")
-"""What of the state the images' graph reads where the BEV encoder has the memory."""
+"""Parts of the state that the images' graph reads where the BEV encoder has the memory."""
 
 
 def padded_state(network: PredMapNet, rows: int) -> StreamState:

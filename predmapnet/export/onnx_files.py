@@ -38,7 +38,7 @@ MOST_CAMERAS = 8
 
 @dataclass(frozen=True)
 class GraphFolder:
-    """What ``network.json`` says of the graphs beside it.
+    """Content of ``network.json``: a description of the graphs beside it.
 
     Attributes:
         folder: where they are.
@@ -140,7 +140,7 @@ def _example_rig(config: PredMapNetConfig) -> Rig:
 
 
 def _dynamic_axes(inputs: Mapping[str, Tensor]) -> dict[str, dict[int, Any]]:
-    """Which axes of the images' graph vary: the cameras, and what they see."""
+    """Axes of the images' graph that vary: the cameras, and what they see."""
     cameras = torch.export.Dim("cameras", min=1, max=MOST_CAMERAS)
     pixels, pairs = torch.export.Dim("pixels", min=2), torch.export.Dim("pairs", min=2)
     axes: dict[str, dict[int, Any]] = {name: {} for name in inputs}

@@ -19,7 +19,7 @@ from predmapnet.network.maptracker.reference_points import ReferencePoints
 from predmapnet.network.small.ground_lookup import GroundLookup
 
 ViewGeometry = GroundLookup | ReferencePoints
-"""Where the cameras of some frames see the ground, as the BEV encoder takes it; may be kept while they stay put."""
+"""Ground as the cameras of some frames see it, as the BEV encoder takes it; may be kept while they stay put."""
 
 
 @dataclass

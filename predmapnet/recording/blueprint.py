@@ -68,7 +68,7 @@ class Extent:
 
 @dataclass(frozen=True)
 class Content:
-    """What a recording of a scene has to show.
+    """Content of a recording of a scene.
 
     Attributes:
         extent: of the drive and what lies around it.

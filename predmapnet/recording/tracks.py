@@ -26,7 +26,7 @@ class Tracks:
 
     @property
     def labels(self) -> list[str]:
-        """What a pointer on a track is told, one text a track."""
+        """Texts shown to a pointer on a track, one a track."""
         found = self.frame_map
         return [
             f"{ElementKind(kind).noun} {track}, score {score:.2f}, {age:.1f} s old"

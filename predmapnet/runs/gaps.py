@@ -1,4 +1,4 @@
-"""What a run lacked: images of cameras, and elements in its map. It is said, and written into every file."""
+"""Gaps of a run: missing images of cameras, and an empty map. They are said, and written into every file."""
 
 from __future__ import annotations
 

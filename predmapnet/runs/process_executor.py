@@ -87,7 +87,7 @@ class _Process:
             self.pipe.send(task)
 
     def answer(self) -> Answer:
-        """What it says; an answer that came before its death counts."""
+        """Read the answer of the worker; one that came before its death counts."""
         with suppress(EOFError, OSError):
             if self.pipe.poll():
                 answer: Answer = self.pipe.recv()

@@ -117,7 +117,7 @@ class _Actors:
         return [(of_reference[reference], self._answer(reference)) for reference in ready]
 
     def _answer(self, reference: Any) -> Answer:
-        """What an actor says; whatever Ray itself raises means that the actor or its node is gone."""
+        """Read the answer of an actor; whatever Ray itself raises means that the actor or its node is gone."""
         try:
             answer: Answer = self._ray.get(reference)
             return answer

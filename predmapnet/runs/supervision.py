@@ -28,7 +28,7 @@ class TimeLimitError(UserError):
 
 
 class State(Enum):
-    """What an answer tells of a worker."""
+    """State of a worker, as its answer tells."""
 
     READY = "ready"
     UNFIT = "unfit"

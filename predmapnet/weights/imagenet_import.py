@@ -43,7 +43,7 @@ _DETECTRON = re.compile(
 
 @dataclass(frozen=True)
 class BackboneReport:
-    """How a file of ImageNet weights was used.
+    """Report of the use of a file of ImageNet weights.
 
     Attributes:
         mapped: name in the file to name here.

@@ -38,7 +38,7 @@ MOST_CAMERAS = 8
 
 @dataclass(frozen=True)
 class LogCalibration:
-    """What ``calibration.json`` says.
+    """Content of ``calibration.json``.
 
     Attributes:
         rig: the cameras, undistorted.

@@ -25,7 +25,7 @@ SPACING = 5.0
 DRIVEN = 40.0
 """The way of the car is drawn this far ahead and behind, metres."""
 NEAREST = 0.5
-"""What lies nearer to the plane of the camera is not drawn, metres."""
+"""Least depth of what is drawn, metres from the plane of the camera."""
 GRID, AXES, WAY, HORIZON = (70, 200, 90), (40, 110, 255), (255, 210, 0), (255, 80, 200)
 """RGB of the grid, of its lines through the origin, of the car's way and of the horizon."""
 

@@ -1,4 +1,4 @@
-"""Whether images move as calibration and poses say: wrong extrinsics, mirrored and turned images show in it.
+"""Motion of images against calibration and poses, which shows wrong extrinsics, mirrored and turned images.
 
 Points are followed from an image to a later one. Where the cameras were is known, so each point that stands still has a
 place in space. With a right calibration nearly all of them lie in front of the camera and not below the road.
@@ -30,17 +30,17 @@ POINTS = 400
 STILL = 1.0
 """Points that move less tell nothing, pixels."""
 RETURNING = 0.7
-"""How far from where it began a point may end that is followed there and back, pixels."""
+"""Largest distance between the ends of a point that is followed there and back, pixels."""
 OFF_LINE, OFF_FAR_POINT = 2.0, 1.0
-"""How far a point may lie off the line on which it must move, and off where it would be if it were far away, pixels of
-an image of full width."""
+"""Largest distance of a point from the line on which it must move, and from where it would be if it were far away,
+pixels of an image of full width."""
 BELOW_ROAD = (0.5, 0.04)
-"""How far below the road points may seem to lie: metres, and metres for each metre of distance."""
+"""Largest depth below the road at which points may seem to lie: metres, and metres for each metre of distance."""
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the motion in images best.
+    """Best explanation of the motion in images.
 
     Attributes:
         wrong: what is wrong then; empty if that is nothing.
@@ -104,7 +104,7 @@ def _as_it_is(pair: _Pair) -> _Pair:
 
 
 def _hypotheses(camera: Camera) -> list[tuple[str, Callable[[_Pair], _Pair], Camera]]:
-    """What may be wrong: its name, how points are then moved in the image, and the camera as it then sits."""
+    """Possible fault: its name, how points are then moved in the image, and the camera as it then sits."""
     width, height = camera.width, camera.height
 
     def flipped(x: bool, y: bool) -> Callable[[_Pair], _Pair]:

@@ -1,4 +1,4 @@
-"""What is wrong with a log of one's own: calibration, images and poses by themselves and against each other."""
+"""Check of a log of one's own: calibration, images and poses by themselves and against each other."""
 
 from __future__ import annotations
 

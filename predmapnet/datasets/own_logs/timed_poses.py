@@ -15,7 +15,7 @@ from predmapnet.files import write_file
 LONGEST_GAP = 1_000_000_000
 """Poses farther apart say nothing about the way between them, nanoseconds."""
 FARTHEST_BEYOND = 100_000_000
-"""How far before the first and after the last pose the drive is carried on, nanoseconds."""
+"""Time by which a drive is carried on before its first and after its last pose, nanoseconds."""
 
 
 @dataclass(frozen=True)

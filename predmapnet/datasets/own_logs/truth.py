@@ -1,4 +1,4 @@
-"""What is true along a log of one's own: lines of the whole drive, in ``truth.json`` or ``truth.geojson``."""
+"""Ground truth of a log of one's own: lines of the whole drive, in ``truth.json`` or ``truth.geojson``."""
 
 from __future__ import annotations
 

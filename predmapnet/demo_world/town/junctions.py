@@ -14,7 +14,7 @@ from predmapnet.demo_world.town.cross_sections import CrossSection
 from predmapnet.demo_world.town.street_plan import Arm, Rank, StreetPlan
 
 LOCAL_REACH = 65.0
-"""How far along its arms a junction is looked at, metres."""
+"""Length of the arms that belongs to a junction, metres."""
 
 FLAT = np.radians(152.0)
 """Two arms at a larger angle than this have no corner between them."""
@@ -39,7 +39,7 @@ class ArmReach:
 
     @property
     def clear(self) -> float:
-        """Where the kerbs of both sides have left the corners."""
+        """Distance along an arm at which the kerbs of both sides have left the corners."""
         return max(self.left_clear, self.right_clear)
 
 

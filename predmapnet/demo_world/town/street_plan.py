@@ -13,7 +13,7 @@ from mapfusion.arrays import Float
 from predmapnet.demo_world.town.reference_line import ReferenceLine, draw_curvature, grow_line, reverse_and_join
 
 TOWN_CENTRE = np.array([400.0, 400.0])
-"""Where every town lies in the global frame, metres: all coordinates stay positive."""
+"""Place of every town in the global frame, metres: all coordinates stay positive."""
 
 REACH = 235.0
 """Through streets leave the town at this distance from its centre, metres."""
