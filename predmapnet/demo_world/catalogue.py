@@ -19,7 +19,7 @@ from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
-WORLD_VERSION = 2
+WORLD_VERSION = 3
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
 
 SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "test": range(101, 111)}
@@ -137,7 +137,7 @@ def build_world(name: str, edition: int = WORLD_VERSION) -> World:
     number = scene_number(name, edition)
     if edition == 1:
         return dress(*first_town(number), look_of(name), number, name)
-    return dress(vector_map(name), trajectory(name), look_of(name), number, name)
+    return dress(vector_map(name), trajectory(name), look_of(name), number, name, cluttered=True)
 
 
 def default_cache() -> Path:

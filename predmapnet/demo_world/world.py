@@ -170,6 +170,26 @@ class Solids:
 
 
 @dataclass(frozen=True)
+class Clutter:
+    """What is on the ground and no element of the map, though it may look like one.
+
+    Attributes:
+        patches: (material, ``(n, 4, 2)`` quadrilaterals, metres), each over those before it.
+        paint, coats: ``(n, 4, 2)`` painted quadrilaterals and ``(n, 3)``: wear, albedo, 1 for yellow and 0 for white.
+        stains: (``(4, 2)`` outline, light that is left, [0, 255]): tracks of tyres and oil.
+        shadows: the same for shadows of what stands out of sight; drawn where the sun shines.
+        kerbs: shares of stretches whose kerb is light, grey, dark, or not to be seen at all.
+    """
+
+    patches: tuple[tuple[str, Float], ...] = ()
+    paint: Float = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    coats: Float = field(default_factory=lambda: np.zeros((0, 3)))
+    stains: tuple[tuple[Float, int], ...] = ()
+    shadows: tuple[tuple[Float, int], ...] = ()
+    kerbs: tuple[float, float, float, float] = (0.36, 0.34, 0.16, 0.14)
+
+
+@dataclass(frozen=True)
 class World:
     """Everything that the renderer needs to draw one scene. Deterministic in ``seed``."""
 
@@ -180,3 +200,4 @@ class World:
     trajectory: Trajectory
     surfaces: tuple[Surface, ...] = field(repr=False)
     solids: Solids = field(repr=False)
+    clutter: Clutter = field(default_factory=Clutter, repr=False)

@@ -44,6 +44,11 @@ MATERIALS: dict[str, tuple[float, float, float, float, float, float, float]] = {
     "kerb_light": (0.420, 0.410, 0.385, 0.10, 0.14, 0.12, 0.0),
     "kerb_grey": (0.240, 0.235, 0.225, 0.12, 0.18, 0.15, 0.0),
     "kerb_dark": (0.135, 0.130, 0.122, 0.15, 0.20, 0.15, 0.0),
+    "slab": (0.235, 0.230, 0.215, 0.10, 0.12, 0.15, 0.0),
+    "rail": (0.270, 0.262, 0.250, 0.20, 0.10, 0.05, 0.0),
+    "leaves": (0.150, 0.085, 0.035, 0.60, 0.40, 0.20, 0.0),
+    "red_asphalt": (0.180, 0.075, 0.060, 0.20, 0.14, 0.15, 0.0),
+    "green_asphalt": (0.065, 0.130, 0.080, 0.20, 0.14, 0.15, 0.0),
     "gutter": (0.215, 0.210, 0.200, 0.12, 0.18, 0.18, 0.0),
 }
 _INDEX = {name: index for index, name in enumerate(MATERIALS)}
@@ -133,7 +138,13 @@ def _rings(geometry: shapely.Geometry) -> list[Float]:
     return rings
 
 
-def _draw_kerbs(material: Byte, sheet: _Sheet, road: shapely.Geometry, generator: np.random.Generator) -> None:
+def _draw_kerbs(
+    material: Byte,
+    sheet: _Sheet,
+    road: shapely.Geometry,
+    shares: tuple[float, float, float, float],
+    generator: np.random.Generator,
+) -> None:
     """A strip outside the road's edge whose material changes along the way; its inner side is the boundary."""
     for ring in _rings(road):
         ring = shapely.get_coordinates(shapely.segmentize(shapely.LineString(ring), 4.0))
@@ -143,7 +154,7 @@ def _draw_kerbs(material: Byte, sheet: _Sheet, road: shapely.Geometry, generator
         start = 0
         while start < len(outside):
             stop = start + int(generator.integers(4, 20))
-            kind = kinds[int(generator.choice(4, p=[0.36, 0.34, 0.16, 0.14]))]
+            kind = kinds[int(generator.choice(4, p=shares))]
             if kind:
                 _fill_quads(material, sheet, outside[start:stop], _INDEX[kind])
             if gutter and kind:
@@ -201,7 +212,9 @@ class _Darkness(NamedTuple):
 def _darkness(world: World, light: Light) -> _Darkness:
     standing = ~world.solids.velocity.any(axis=1) & world.solids.always
     shadows = shadow_polygons(world.solids, standing, light.sun_direction) if light.sun.any() else []
-    return _Darkness(contact_polygons(world.solids, standing), shadows)
+    if light.sun.any():
+        shadows = [*shadows, *world.clutter.shadows]
+    return _Darkness([*contact_polygons(world.solids, standing), *world.clutter.stains], shadows)
 
 
 def _shade(sheet: _Sheet, dark: _Darkness) -> tuple[Byte, Byte]:
@@ -234,7 +247,9 @@ def _pyramid(
     generator = np.random.default_rng([world.seed, 29])
     if near is not None:
         _draw_damage(material, sheet, road, near, world.seed)
-    _draw_kerbs(material, sheet, road, generator)
+        for name, quads in world.clutter.patches:
+            _fill_quads(material, sheet, quads, _INDEX[name])
+    _draw_kerbs(material, sheet, road, world.clutter.kerbs, generator)
     occlusion, shadow = _shade(sheet, dark)
 
     table = np.array(list(MATERIALS.values()), dtype=np.float32)
@@ -280,7 +295,9 @@ def paint_ground(world: World, light: Light, texel: float = FINE_TEXEL) -> tuple
     near = np.column_stack([positions, np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])
     road = road_of(world)
     dark = _darkness(world, light)
-    paint = paint_quads(world.map, world.seed)
+    corners, attributes = paint_quads(world.map, world.seed)
+    clutter = world.clutter
+    paint = np.concatenate([corners, clutter.paint]), np.concatenate([attributes, clutter.coats])
     fine = _pyramid(_sheet(positions, FINE_MARGIN, texel, turn, anchor), world, light, road, dark, paint, near)
     wide = _sheet(positions, COARSE_MARGIN, COARSE_TEXEL, turn, anchor)
     coarse = _pyramid(wide, world, light, road, dark, paint, None)

@@ -7,9 +7,10 @@ import shapely
 from shapely import Polygon
 
 from mapfusion.arrays import Float
+from predmapnet.demo_world.street.clutter import draw_clutter
 from predmapnet.demo_world.street.solid_list import SolidList
 from predmapnet.demo_world.street.traffic import Parking, add_moving_traffic, ego_corridor, footprint
-from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
+from predmapnet.demo_world.world import Clutter, Look, Surface, Trajectory, VectorMap, World
 
 SIGHT = 110.0
 """Metres from the trajectory within which things are put up."""
@@ -155,7 +156,9 @@ def _put_up_furniture(
                 solids.pedestrian(spot + out * generator.uniform(-0.4, 0.8), generator)
 
 
-def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, name: str) -> World:
+def dress(
+    vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, name: str, cluttered: bool = False
+) -> World:
     """Make up everything that a vector map does not hold; the same seed gives the same world.
 
     Args:
@@ -164,6 +167,7 @@ def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, 
         look: light and weather.
         seed: of all that is drawn by chance.
         name: of the scene.
+        cluttered: put on the ground what looks like elements of the map and is none.
     """
     generator = np.random.default_rng([seed, 31])
     positions = trajectory.ego_to_global[:, :2, 3]
@@ -185,4 +189,5 @@ def dress(vector_map: VectorMap, trajectory: Trajectory, look: Look, seed: int, 
     parking.in_bays(vector_map.parking, busy)
     parking.along_kerbs(road, sight, 0.34 * busy)
     add_moving_traffic(solids, vector_map, road, trajectory, seed)
-    return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids())
+    clutter = draw_clutter(vector_map, road, trajectory, seed) if cluttered else Clutter()
+    return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids(), clutter)
