@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import rerun.blueprint as rrb
 
 from mapfusion.arrays import Float
@@ -33,6 +34,13 @@ EYE_OVER_HEIGHT = 1.0
 PANEL_ASPECT = 1.3
 """Width of the panel of a whole map, as a share of its height."""
 
+EARTH_PANEL = 500.0
+"""Points of the screen that a map on Earth fills at first sight."""
+METRES_PER_POINT = 110_000.0
+"""Of a web map at zoom 0, at 45 degrees of latitude; each step of the zoom halves them."""
+CLOSEST = 19.0
+"""Zoom to which tiles of OpenStreetMap are drawn."""
+
 TRUTH, GROWING_MAP, WHOLE_MAP = "world/ground_truth", "world/map", "world/whole_map"
 
 
@@ -55,6 +63,12 @@ class Extent:
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
         (x, y), (width, height) = ((low + high) / 2).tolist(), (high - low).tolist()
         return cls((x, y), width, height)
+
+    @property
+    def zoom(self) -> float:
+        """Zoom of a web map that shows all of it."""
+        metres = max(self.width, self.height, 40.0)
+        return min(float(np.log2(METRES_PER_POINT * EARTH_PANEL / metres)), CLOSEST)
 
     @property
     def eye(self) -> rrb.EyeControls3D:
@@ -114,7 +128,7 @@ def map_blueprint(extent: Extent, on_earth: bool) -> rrb.Blueprint:
         on_earth: whether their place on Earth is known.
     """
     view = rrb.Spatial3DView(origin="world", name="Map", background=BACKGROUND, eye_controls=extent.eye)
-    shown = rrb.Tabs(view, _earth_view(), active_tab=0) if on_earth else view
+    shown = rrb.Tabs(view, _earth_view(extent), active_tab=0) if on_earth else view
     text = rrb.TextDocumentView(origin="description", name="What this is")
     return _blueprint(rrb.Horizontal(shown, text, column_shares=[3, 1]), rrb.TimePanel(state="hidden"))
 
@@ -162,12 +176,12 @@ def _map_tabs(content: Content, live: bool) -> rrb.Tabs:
     if content.truth:
         views.append(_world_view("With ground truth (grey)", "world", content.extent.eye, without, truth=True))
     if content.on_earth:
-        views.append(_earth_view())
+        views.append(_earth_view(content.extent))
     return rrb.Tabs(*views, active_tab=0)
 
 
-def _earth_view() -> rrb.MapView:
-    return rrb.MapView(origin="earth", name="On Earth", background=rrb.MapProvider.OpenStreetMap)
+def _earth_view(extent: Extent) -> rrb.MapView:
+    return rrb.MapView(origin="earth", name="On Earth", zoom=extent.zoom, background=rrb.MapProvider.OpenStreetMap)
 
 
 def _bev_column(content: Content, shape: tuple[int, int], column: int) -> rrb.Vertical | None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from mapfusion.colours import KIND_COLOURS
 from mapfusion.elements import RegionOfInterest
+from predmapnet.recording.blueprint import Extent
 from predmapnet.recording.palette import raster_picture
 from predmapnet.recording.projection import bev_pixels, dashes, project_line, true_runs
 from predmapnet.scenes import Camera
@@ -80,3 +81,11 @@ def test_the_strongest_raster_gives_the_colour():
 
 def test_no_rasters_make_a_dark_picture():
     assert raster_picture(np.zeros((0, 4, 8), dtype=np.float32), np.zeros(0, dtype=np.int64)).shape == (4, 8, 3)
+
+
+@pytest.mark.parametrize(("metres", "points"), [(500.0, 500.0), (20_000.0, 500.0), (50.0, 240.0)])
+def test_a_map_on_earth_fills_its_panel_as_far_as_there_are_tiles(metres, points):
+    """At 45 degrees of latitude, on tiles of 256 points that show the whole equator at zoom 0."""
+    zoom = Extent((0.0, 0.0), metres, metres / 3).zoom
+    metres_per_point = 40_075_016.7 / 256 * np.cos(np.radians(45)) / 2**zoom
+    assert metres / metres_per_point == pytest.approx(points, rel=0.03)
