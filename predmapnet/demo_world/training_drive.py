@@ -91,11 +91,16 @@ def training_drive(
     )
 
 
+def training_rig(name: str, any_car: bool) -> Rig:
+    """Return the cameras of a scene: training scenes have a car of their own if ``any_car``, others the demo car."""
+    number = scene_number(name)
+    return sample_rig(number) if any_car and number in SPLITS["train"] else DEMO_RIG
+
+
 def _car_and_light(world: World, any_car: bool) -> tuple[Rig, Response, Light]:
     """The cameras of a scene, how they expose, and the light of the scene."""
     number, light = scene_number(world.name), light_of(world.look, world.seed)
-    rig, response = DEMO_RIG, Response()
+    rig, response = training_rig(world.name, any_car), Response()
     if number in SPLITS["train"]:
-        rig = sample_rig(number) if any_car else DEMO_RIG
         response, light = draw_response(number), harder_light(light, number)
     return rig, replace(response, blur=float(np.hypot(response.blur, SCALING_BLUR))), light

@@ -45,24 +45,25 @@ def fill_features(
     Args:
         network: whose encoders are used; left in evaluation mode.
         scenes: to encode.
-        folder: below which a folder is named after the weights, so that features of others are never mixed in.
+        folder: below which a folder is named after the encoders, so that features of others are never mixed in.
         rank, size: which process of how many.
         report: gets a line now and then.
     """
-    digest = sha256()
+    config = network.config
+    digest = sha256(f"{config.image} {config.bev} {config.roi}".encode())
     for part in ENCODERS:
         for value in network.get_submodule(part).state_dict().values():
             digest.update(value.cpu().contiguous().numpy().tobytes())
-    store = FeatureStore(folder / f"features-{digest.hexdigest()[:12]}", feature_shapes(network))
+    store = FeatureStore(folder / f"features-{digest.hexdigest()[:12]}", feature_shapes(network), scenes.scenes)
     network.eval()
-    missing = [index for index in range(len(scenes.scenes)) if not store.has(index)][rank::size]
+    missing = [index for index in range(rank, len(scenes.scenes), size) if not store.has(index)]
     for done, scene in enumerate(missing, start=1):
         features = []
         for start in range(0, frames := len(scenes.scenes[scene]), ENCODE_BATCH):
             numbers = range(start, min(start + ENCODE_BATCH, frames))
             loaded = [scenes.load(scene, frame, store.mirrored(scene)) for frame in numbers]
-            batch = collate_frames(loaded, network.config).to(network.device)
-            images = normalise_images(batch.images, network.config.image)
+            batch = collate_frames(loaded, config).to(network.device)
+            images = normalise_images(batch.images, config.image)
             inputs = FrameInputs(images, batch.camera_valid, batch.ego_to_global, batch.calibration)
             features.append(network.encode_bev(network.encode_images(inputs), inputs))
         store.write(scene, features)

@@ -62,7 +62,7 @@ class StageTraining(nn.Module):
         seed: of draws and noise, together with the step and the stream.
         rank: number of this process: whichever process a stream is in, it draws the same.
         carried: what the streams of the last step go on with.
-        shared: averages counts over all processes.
+        shared: averages counts over all ``processes``.
         low_precision: the image backbone and the BEV encoder compute in bfloat16; everything else never does.
         save_memory: their activations are computed again in the backward pass.
     """
@@ -75,6 +75,7 @@ class StageTraining(nn.Module):
         self.network, self.stage, self.seed, self.rank = network, stage, seed, rank
         self.carried: Past | None = None
         self.shared: Callable[[Tensor], Tensor] = lambda counts: counts
+        self.processes = 1
         self.low_precision = self.save_memory = False
         size = torch.tensor([network.config.roi_length, network.config.roi_width])
         self.register_buffer("_size", size, persistent=False)
@@ -127,7 +128,7 @@ class StageTraining(nn.Module):
                 add_forecasts(sums, past.state.forecasts, past.owners, truths[number + 1], self._size, weights)
         if stage.data == "streams" and past.state is not None:
             self.carried = Past(detached(past.state), past.owners)
-        return sums.means(self.shared, 1 / count if weights.mean_over_frames else 1.0)
+        return sums.means(self.shared, self.processes, 1 / count if weights.mean_over_frames else 1.0)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return what the streams go on with, for a checkpoint."""

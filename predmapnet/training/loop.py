@@ -177,7 +177,7 @@ class Trainer:
             self.average.decay, self.average.updates = stage.optimiser.average_decay, position.average_updates
         seed, rank = (settings.seed, crc32(stage.name.encode())), self._fabric.global_rank
         training = StageTraining(self.network, stage, seed, rank).to(device)
-        training.shared = self._mean
+        training.shared, training.processes = self._mean, self._fabric.world_size
         training.low_precision, training.save_memory = settings.low_precision, settings.save_memory
         optimiser = make_optimiser(self.network, stage.optimiser)
         torch.manual_seed(crc32(repr((seed, rank)).encode()))

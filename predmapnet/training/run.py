@@ -15,6 +15,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
 from predmapnet.training.data.draws import TrainingScenes
+from predmapnet.training.data.fill_cache import expected_bytes
 from predmapnet.training.data.prepare import DataOptions, count_frames, prepare_data
 from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.dry_run import plan_table
@@ -87,9 +88,12 @@ def train_network(options: RunOptions, report: Report = print) -> Path | None:
 
 def dry_run(options: RunOptions) -> Table:
     """Return the plan of a run as a table; nothing is trained or made. Raises UserError where it cannot be."""
-    frames = count_frames(options.data)
+    frames, images = count_frames(options.data, options.config)
     plan = plan_stages(choose_stages(options.config, options.stage), frames, options.plan)
-    return plan_table(plan, PredMapNet(options.config), frames, options.loop)
+    table = plan_table(plan, PredMapNet(options.config), frames, options.loop)
+    size = expected_bytes(images, options.config) / 1e9
+    table.caption = f"The cache of {images} images in {options.data.cache} takes about {size:.1f} GB."
+    return table
 
 
 def run_stages(fabric: Fabric, options: RunOptions, data: Data | None, report: Report) -> bool:
@@ -119,10 +123,17 @@ def run_stages(fabric: Fabric, options: RunOptions, data: Data | None, report: R
     for planned in plan_stages(stages, frames, replace(options.plan, devices=size)):
         if planned.stage.name in trainer.position.finished:
             continue
-        store = None
+        store, seen = None, scenes.digest
         if planned.stage.data == "streams":
+            seen += f" {planned.batch} {size}"
             store = fill_features(trainer.result.to(fabric.device), scenes, options.folder, rank, size, report)
             fabric.barrier()
+        if trainer.position.stage == planned.stage.name and trainer.position.data not in ("", seen):
+            raise UserError(
+                f"Stage {planned.stage.name} of {options.folder} has begun with other data. Go on with the same "
+                "--data, --towns and, in streams, --batch and --devices, or begin another run with --init."
+            )
+        trainer.position.data = seen
         if not trainer.run(planned, StageData(planned, scenes, seed, rank, size, options.workers, store), measure):
             return False
     return True

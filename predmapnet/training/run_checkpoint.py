@@ -36,6 +36,7 @@ class Position:
         finished: names of the stages that are complete.
         average_updates: of the moving average.
         metrics_bytes: size of the metrics file.
+        data: what the stage sees.
     """
 
     stage: str = ""
@@ -50,6 +51,7 @@ class Position:
     finished: list[str] = field(default_factory=list)
     average_updates: int = 0
     metrics_bytes: int = 0
+    data: str = ""
 
     def begin(self, stage: str) -> None:
         """Stand at the beginning of a stage."""

@@ -1,6 +1,7 @@
 """``predmapnet train``: the plan, and mistakes that are told before anything is made."""
 
 import json
+import re
 
 from tests.cli.tiny_nuscenes import write_tiny_nuscenes
 
@@ -12,6 +13,7 @@ def test_a_dry_run_prints_the_plan_and_makes_nothing(predmapnet, tmp_path):
     assert "lite, 4000 frames" in said
     single = next(line for line in plan.out.splitlines() if "single" in line)
     assert all(part in single for part in ("24", str(24 * (4000 // 12)), "0.00141", "GiB"))
+    assert re.search(r"cache of 2\d{4} images in \S+ takes about 0\.[2-4] GB", said)
     assert not (tmp_path / "runs").exists() and not (tmp_path / "cache" / "training").exists()
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from itertools import count
 from typing import Any
 
@@ -45,6 +46,12 @@ class TrainingScenes:
     scenes: Sequence[CachedScene]
     weights: Sequence[float]
     config: PredMapNetConfig
+
+    @property
+    def digest(self) -> str:
+        """Tell what is drawn from: scenes, their order and their weights."""
+        named = [(scene.folder.parent.name, scene.name, len(scene)) for scene in self.scenes]
+        return sha256(repr((named, list(self.weights))).encode()).hexdigest()[:20]
 
     def load(self, scene: int, frame: int, mirrored: bool, images: bool = True) -> CachedFrame:
         """Read one frame, mirrored or not."""

@@ -38,8 +38,8 @@ from predmapnet.training.data.scene_cache import (
 from predmapnet.training.settings import Report
 
 REPORT_SECONDS = 10.0
-BYTES_PER_PIXEL = 0.25
-"""Of the JPEGs: measured on photographs of nuScenes at 480 x 800."""
+BYTES_PER_IMAGE, BYTES_PER_PIXEL = 5000, 0.25
+"""Of the JPEGs: measured on photographs of nuScenes at 480 x 800 and on demo towns at 96 x 256."""
 
 
 class FilledFrame(NamedTuple):
@@ -62,7 +62,7 @@ class FilledFrame(NamedTuple):
 
 def expected_bytes(images: int, config: PredMapNetConfig) -> float:
     """Return about how many bytes the cache of some images takes."""
-    return images * config.image.width * config.image.height * BYTES_PER_PIXEL
+    return images * (BYTES_PER_IMAGE + config.image.width * config.image.height * BYTES_PER_PIXEL)
 
 
 def fill_from_source(

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import BevFormerConfig, LookupBevConfig, PredMapNetConfig
 from predmapnet.datasets.splits import split_names
 from predmapnet.demo_world.catalogue import WORLD_VERSION, scene_infos
 from predmapnet.demo_world.source import DEMO
+from predmapnet.demo_world.training_drive import training_rig
 from predmapnet.errors import UserError
 from predmapnet.scenes import SceneInfo
 from predmapnet.sources import DATASETS, open_source
@@ -142,17 +143,27 @@ def _prepare(
     return folder, learned, measured
 
 
-def count_frames(options: DataOptions) -> int:
-    """Return how many frames an epoch has; nothing is made. Raises UserError for data that is not there."""
-    total = 0.0
+def count_frames(options: DataOptions, config: PredMapNetConfig) -> tuple[int, int]:
+    """Return how many frames an epoch has, and about how many images the cache will hold; nothing is made.
+
+    Raises:
+        UserError: data are not there.
+    """
+    total, images, any_car = 0.0, 0, isinstance(config.bev, LookupBevConfig)
     for chosen in options.sets:
         if chosen.name == DEMO:
-            infos, learned = scene_infos("train"), _demo_names("train", options.towns)
+            infos = (*scene_infos("train"), *scene_infos("val"))
+            learned, measured = _demo_names("train", options.towns), _demo_names("val", options.validation)
+            cameras = [len(training_rig(name, any_car)) for name in learned + measured]
         else:
-            infos = tuple(open_source(chosen.name, chosen.root, options.split_scheme)[0].scenes())
-            learned, _ = _names(infos, options.validation)
-        total += chosen.weight * sum(info.frames for info in infos if info.name in set(learned))
-    return round(total)
+            source, _ = open_source(chosen.name, chosen.root, options.split_scheme)
+            infos = tuple(source.scenes())
+            learned, measured = _names(infos, options.validation)
+            cameras = [len(source.open(name).rig) for name in (learned + measured)[:1]] * len(learned + measured)
+        frames = {info.name: info.frames for info in infos}
+        total += chosen.weight * sum(frames[name] for name in learned)
+        images += sum(frames[name] * count for name, count in zip(learned + measured, cameras, strict=True))
+    return round(total), images
 
 
 def _demo_names(split: str, count: int) -> list[str]:
@@ -177,7 +188,7 @@ def _names(infos: Sequence[SceneInfo], validation: int) -> tuple[list[str], list
 
 
 def cache_folder(cache: Path, dataset: str, config: PredMapNetConfig) -> Path:
-    """Name the cache of a data set by all that images and depth depend on.
+    """Name the cache of a data set by all that images, codes of cameras, truth and depth depend on.
 
     Args:
         cache: folder of all training caches.
@@ -185,5 +196,6 @@ def cache_folder(cache: Path, dataset: str, config: PredMapNetConfig) -> Path:
         config: of the network.
     """
     depth = f" {config.depth} {config.bev.kind}" if config.depth.enabled else ""
-    key = f"{config.image} {config.bev.kind} {config.roi_length} {config.roi_width}{depth}"
+    codes = f" {config.bev.cameras}" if isinstance(config.bev, BevFormerConfig) else ""
+    key = f"{config.image} {config.bev.kind} {config.roi_length} {config.roi_width}{depth}{codes}"
     return cache / f"{dataset}-{config.image.width}x{config.image.height}-{sha256(key.encode()).hexdigest()[:8]}"

@@ -7,8 +7,10 @@ pose, calibration, truth and depth, each with a checksum; ``index.npz`` is writt
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -79,9 +81,15 @@ def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 def read_arrays(path: Path, without: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
     """Read the arrays of a file, all but some. Raises UserError for one that is missing or damaged."""
+    with _opened(path) as stored:
+        return {name: stored[name] for name in stored.files if name not in without}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files if name not in without}
+            yield stored
     except (OSError, ValueError, EOFError, NotImplementedError, zlib.error, BadZipFile) as error:
         raise UserError(f"{path} of the training cache is damaged ({error}). Train again: it is made anew.") from None
 
@@ -103,6 +111,14 @@ class CachedScene:
 
     def __len__(self) -> int:
         return len(self._numbers)
+
+    def digest(self) -> str:
+        """Tell the frames of this scene from all others. Raises UserError where one is missing or damaged."""
+        found = sha256()
+        for number in self._numbers.tolist():
+            with _opened(frame_path(self.folder, number)) as stored:
+                found.update(repr([(member.filename, member.CRC) for member in stored.zip.infolist()]).encode())
+        return found.hexdigest()[:20]
 
     def frame(self, index: int, images: bool = True) -> CachedFrame:
         """Read one frame, its images (and its depth) only where they are asked for. Raises UserError for damage."""

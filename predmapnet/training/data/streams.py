@@ -18,7 +18,7 @@ from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.augmentation import AugmentationSettings, disturb_pose
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.data.draws import EpochOrder, TrainingScenes
-from predmapnet.training.data.scene_cache import CachedFrame
+from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import StreamSettings
 
@@ -26,14 +26,16 @@ NO_TRUTH = FrameTruth(np.zeros(0, np.int64), (), np.zeros(0, np.int64))
 
 
 class FeatureStore:
-    """BEV features of all frames in half precision, one file per scene.
+    """BEV features of all frames in half precision, one file per scene, named after what is in the scene.
 
     Every other scene is stored mirrored, so that both hands of the world are seen.
     """
 
-    def __init__(self, folder: Path, shapes: tuple[tuple[int, ...], ...]) -> None:
-        """Use a folder, and the shapes ``(C, H, W)`` of the levels."""
-        self._folder, self._shapes = folder, shapes
+    def __init__(self, folder: Path, shapes: tuple[tuple[int, ...], ...], scenes: Sequence[CachedScene]) -> None:
+        """Use a folder that belongs to the encoders, the shapes ``(C, H, W)`` of the levels, and the scenes."""
+        self._shapes = shapes
+        named = (f"{scene.digest()}{'-mirrored' * self.mirrored(at)}.npy" for at, scene in enumerate(scenes))
+        self._paths = [folder / name for name in named]
         folder.mkdir(parents=True, exist_ok=True)
 
     @staticmethod
@@ -43,24 +45,21 @@ class FeatureStore:
 
     def has(self, scene: int) -> bool:
         """Whether a scene is complete."""
-        return self._path(scene).exists()
+        return self._paths[scene].exists()
 
     def write(self, scene: int, features: Sequence[BevFeatures]) -> None:
         """Store the features of all frames of a scene, in batches in their order."""
         rows = [torch.cat([level.flatten(1) for level in each.levels], 1).half().cpu() for each in features]
-        with write_file(self._path(scene)) as temporary:
+        with write_file(self._paths[scene]) as temporary:
             np.save(temporary, torch.cat(rows).numpy())
 
     def read(self, scenes: NDArray[np.int64], frames: NDArray[np.int64]) -> BevFeatures:
         """Return the features of one frame of each of several scenes."""
-        files = (np.load(self._path(int(scene)), mmap_mode="r") for scene in scenes)
+        files = (np.load(self._paths[scene], mmap_mode="r") for scene in scenes)
         rows = torch.from_numpy(np.stack([file[frame] for file, frame in zip(files, frames, strict=True)]))
         parts = rows.float().split([int(np.prod(shape)) for shape in self._shapes], 1)
         levels = [part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True)]
         return BevFeatures([level.contiguous(memory_format=torch.channels_last) for level in levels])
-
-    def _path(self, scene: int) -> Path:
-        return self._folder / f"{scene:05d}.npy"
 
 
 class Streams(Dataset[StreamSegment]):

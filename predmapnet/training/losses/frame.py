@@ -35,10 +35,15 @@ class LossSums:
         for name, mean in means.items():
             self.add(name, mean)
 
-    def means(self, shared: Callable[[Tensor], Tensor], scale: float = 1.0) -> dict[str, Tensor]:
-        """Return the losses by name, times ``scale``; ``shared`` averages counts over all processes."""
+    def means(self, shared: Callable[[Tensor], Tensor], processes: int = 1, scale: float = 1.0) -> dict[str, Tensor]:
+        """Return the losses by name, times ``scale``; ``shared`` averages counts over all processes.
+
+        Together these count one thing at least, so that what nobody found is divided by something.
+        """
         sums = torch.stack([total for _, total, _ in self._entries])
-        counts = shared(torch.tensor([count for _, _, count in self._entries], device=sums.device)).clamp(min=1.0)
+        counts = shared(torch.tensor([count for _, _, count in self._entries], device=sums.device)).clamp(
+            min=1 / processes
+        )
         terms: dict[str, Tensor] = {}
         for (name, _, _), term in zip(self._entries, (scale * sums / counts).unbind(), strict=True):
             terms[name] = terms[name] + term if name in terms else term

@@ -7,6 +7,7 @@ import torch
 from tiny_clips import painted_clip, tiny_network, tiny_paper_config
 
 from predmapnet.network.image_input import normalise_images
+from predmapnet.training.losses.frame import LossSums
 from tests.predmapnet.training import paper_clips
 from tests.predmapnet.training.paper_clips import BEV, JOINT, WARMUP
 
@@ -97,3 +98,13 @@ def test_without_truth_there_is_only_background(clip):
     terms = losses(tiny_network(CONFIG), empty)
     assert float(terms["points"].detach()) == float(terms["mask"].detach()) == float(terms["forecast"].detach()) == 0.0
     assert float(terms["focal"].detach()) > 0.0
+
+
+def test_what_one_of_two_processes_found_alone_counts_as_in_one_that_sees_all():
+    """One thing in all of the batch: half a thing a process."""
+    found, nothing = LossSums(), LossSums()
+    found.add("forecast", torch.tensor(3.0), 1)
+    nothing.add("forecast", torch.tensor(0.0), 0)
+    halves = [sums.means(lambda _: torch.tensor([0.5]), processes=2)["forecast"] for sums in (found, nothing)]
+    assert sum(halves) / 2 == found.means(lambda counts: counts)["forecast"] == 3.0
+    assert nothing.means(lambda counts: counts)["forecast"] == 0.0

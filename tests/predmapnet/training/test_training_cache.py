@@ -6,18 +6,27 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.demo_world.rigs import sample_rig
 from predmapnet.errors import UserError
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import stack_windows
 from predmapnet.presets import preset
 from predmapnet.training.data.fill_cache import expected_bytes
-from predmapnet.training.data.prepare import DataOptions, DataSet, parse_data_sets, prepare_data
+from predmapnet.training.data.prepare import (
+    DataOptions,
+    DataSet,
+    cache_folder,
+    count_frames,
+    parse_data_sets,
+    prepare_data,
+)
 from predmapnet.training.data.scene_cache import INDEX, CachedScene
 from tests.predmapnet.datasets.conftest import write_nuscenes
 
@@ -180,6 +189,27 @@ def test_other_roots_sizes_and_regions_have_caches_of_their_own(town, tmp_path):
     paper = DataOptions((DataSet("nuscenes", town.with_name("moved")),), tmp_path / "cache")
     wider = CONFIG.model_copy(update={"roi_width": 50.0})
     assert prepare_data(paper, wider, 1)[0].scenes[0].folder not in (first, second)
+
+
+def test_codes_of_cameras_have_caches_of_their_own_and_other_networks_share_one():
+    """Images and calibrations of demo scenes are kept without a question."""
+    paper, lite = preset("paper-nuscenes"), preset("lite")
+    turned = paper.model_copy(update={"bev": paper.bev.model_copy(update={"cameras": paper.bev.cameras[::-1]})})
+    wide = paper.model_copy(update={"image": paper.image.model_copy(update={"width": 600})})
+    longer = lite.model_copy(update={"roi_length": 100.0})
+    folders = [cache_folder(Path(), "demo", config) for config in (paper, turned, wide, lite, longer)]
+    assert len(set(folders)) == 5
+    narrow = lite.model_copy(update={"decoder": lite.decoder.model_copy(update={"queries": 10})})
+    assert cache_folder(Path(), "demo", narrow) == folders[3]
+
+
+def test_the_plan_knows_how_many_images_there_are(town):
+    nuscenes, demo = DataSet("nuscenes", town, weight=2.0), DataSet("demo")
+    assert count_frames(DataOptions((nuscenes,), town), CONFIG) == (6, 36)
+    cars = sum(len(sample_rig(number)) for number in (201, 202, 203)) + 2 * 6
+    assert count_frames(DataOptions((demo,), town, towns=3, validation=2), CONFIG) == (120, 40 * cars)
+    both = DataOptions((nuscenes, demo), town, towns=3, validation=2)
+    assert count_frames(both, preset("paper-nuscenes")) == (126, 36 + 40 * 5 * 6)
 
 
 def test_nuscenes_at_the_papers_size_takes_less_than_20_gb():

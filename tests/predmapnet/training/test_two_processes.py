@@ -40,6 +40,10 @@ def calm_config():
 def train(fabric, name, config, scenes, folder, cut_at=None, resume=False):
     torch.manual_seed(0)
     network = PredMapNet(config)
+    for norm in (module for module in network.modules() if isinstance(module, torch.nn.BatchNorm2d)):
+        # A gradient jumps where a ReLU is at zero, and the networks are so small that one of them is half a per cent:
+        # summing two frames in the other order does as much. So the ReLUs are kept away from there.
+        torch.nn.init.constant_(norm.bias, 6.0)
     if name == "joint":
         network.image_backbone = PlainBackbone(config.bev.width)
         torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)
@@ -81,7 +85,5 @@ def test_two_processes_give_the_curve_of_one_and_resume_exactly(tmp_path):
         together, alone = metrics(tmp_path / name), metrics(tmp_path / f"{name}-alone")
         assert [line.pop("stage") for line in together] == [line.pop("stage") for line in alone] == [name] * STEPS
         for one, other in zip(together, alone, strict=True):
-            # The gradient's norm gathers what rounding makes of every parameter.
-            assert one.pop("norm") == pytest.approx(other.pop("norm"), rel=1e-2)
-            assert one == pytest.approx(other, rel=2e-3, abs=1e-4)
-        assert alone[0]["points"] != pytest.approx(alone[1]["points"], rel=1e-2), "there is something to tell apart"
+            assert one == pytest.approx(other, rel=1e-4)
+        assert alone[0]["points"] != pytest.approx(alone[1]["points"], rel=1e-3), "there is something to tell apart"
