@@ -20,6 +20,7 @@ from cli.diff import diff
 from cli.evaluate import evaluate
 from cli.infer import infer
 from cli.integrate import integrate
+from cli.log import log
 from cli.merge import merge
 from cli.plain_help import PlainCommand
 from cli.report import report
@@ -63,6 +64,7 @@ COMMANDS: tuple[Callable[..., None], ...] = (
 )
 for command in COMMANDS:
     app.command(cls=PlainCommand)(command)
+app.add_typer(log)
 app.add_typer(weights)
 
 

@@ -34,7 +34,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise UserError(f"Cannot read the image {path}: {error.strerror}.") from None
     # OpenCV fills a JPEG that was cut short or damaged with grey and says nothing that a program hears.
     if data[:2] == _JPEG_START:
-        _check_jpeg(data, path)
+        check_jpeg(data, f"The image {path}")
     image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _AS_STORED) if data else None
     if image is None:
         raise UserError(f"{path} ({len(data)} bytes) is not an image that can be decoded. Copy or fetch it again.")
@@ -65,7 +65,7 @@ class _Header:
     baseline: bool
 
 
-def _check_jpeg(data: bytes, path: Path) -> None:
+def check_jpeg(data: bytes, where: str) -> None:
     """Raise UserError for a JPEG without an end, or with bytes in its pixels that no writer puts there.
 
     What some cameras write after the end does not matter.
@@ -77,9 +77,9 @@ def _check_jpeg(data: bytes, path: Path) -> None:
     else:
         end = data.find(_JPEG_END, header.pixels)
     if end < 0:
-        raise UserError(f"The image {path} is cut short after {len(data)} bytes. Copy or fetch it again.")
+        raise UserError(f"{where} is cut short after {len(data)} bytes. Copy or fetch it again.")
     if data[end : end + 2] != _JPEG_END:
-        raise UserError(f"The image {path} is damaged at byte {end}. Copy or fetch it again.")
+        raise UserError(f"{where} is damaged at byte {end}. Copy or fetch it again.")
 
 
 def _header(data: bytes) -> _Header:

@@ -138,6 +138,19 @@ def write_rig(path: Path, rig: Rig) -> None:
             "intrinsics": {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] - HALF_A_PIXEL, "cy": k[1, 2] - HALF_A_PIXEL},
             "camera_to_ego": {"translation_m": camera.camera_to_ego[:3, 3].tolist(), "rotation_wxyz": [w, x, y, z]},
         }
-    content = {"ego_origin_above_road_m": -rig[0].ground_height if rig else 0.0, "cameras": cameras}
+    write_calibration(path, cameras, -rig[0].ground_height if rig else 0.0)
+
+
+def write_calibration(path: Path, cameras: Mapping[str, Mapping[str, Any]], height: float) -> None:
+    """Write ``calibration.json``.
+
+    Args:
+        path: of the file.
+        cameras: entries by name, as the file has them.
+        height: of the ego origin above the road, metres.
+
+    Raises:
+        UserError: it cannot be written.
+    """
     with write_file(path) as draft:
-        draft.write_text(json.dumps(content, indent=1))
+        draft.write_text(json.dumps({"ego_origin_above_road_m": height, "cameras": cameras}, indent=1))

@@ -62,8 +62,7 @@ class TimedPoses:
 def rows_apart(positions: Float, metres: float) -> Integer:
     """Return rows of positions ``(n, d)`` along a way that are about so many metres apart, the first one among them."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))])
-    rows = np.searchsorted(way, np.arange(0.0, max(float(way[-1]), metres), metres))
-    return np.unique(np.minimum(rows, len(way) - 1))
+    return np.flatnonzero(np.diff(np.floor(way / metres), prepend=-1.0) > 0)
 
 
 def write_timed_poses(path: Path, poses: TimedPoses) -> None:

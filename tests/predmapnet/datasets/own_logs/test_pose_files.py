@@ -208,3 +208,10 @@ def test_rows_may_come_in_any_order(tmp_path):
     found = read_timed_poses(tmp_path)
     np.testing.assert_array_equal(found.timestamps, poses.timestamps)
     np.testing.assert_allclose(found.ego_to_global, poses.ego_to_global, atol=1e-8)
+
+
+def test_positions_that_are_on_no_earth_are_told(tmp_path):
+    write_timed_poses(tmp_path / "poses.csv", curve())
+    rewritten(tmp_path / "poses.csv", lambda rows: rows[7].update(x="1e154"))
+    with pytest.raises(UserError, match=r"line 9: the position .* no Earth"):
+        read_timed_poses(tmp_path)

@@ -1,0 +1,71 @@
+"""``predmapnet log``: logs of one's own from recordings."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.options import Json
+from cli.plain_help import PlainCommand
+
+log = typer.Typer(name="log", help="Make logs of your own from recordings.", no_args_is_help=True)
+
+
+@log.command("from-bag", cls=PlainCommand)
+def from_bag(
+    bag: Annotated[
+        Path,
+        typer.Argument(help="ROS 2 bag: a file (.mcap, .db3, also .zstd) or a folder of them.", metavar="BAG"),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log to make.")],
+    camera_topics: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--camera-topic",
+            help="Image topic to take; can be repeated. Default: all with a camera info and a place on the car.",
+            show_default=False,
+        ),
+    ] = None,
+    base_frame: Annotated[
+        str | None,
+        typer.Option(help="Frame of the car. Default: base_link, or what is customary.", show_default=False),
+    ] = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            help="Frame that the car drives in, or odometry topic. Default: transforms to map, world or odom, or else "
+            "odometry.",
+            show_default=False,
+        ),
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option(
+            help="Metres of the car's frame above the road. Default: as base_footprint says, or 0.", show_default=False
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a log of your own from a ROS 2 bag (extra 'bags'; no ROS is needed).
+
+    Images, camera infos, transforms and odometry become images by camera and time, calibration.json and poses.csv.
+    `predmapnet infer FOLDER` maps them (docs/own-logs.md). What was left out or lost is said.
+    """
+    from cli.console import counted, print_json, progress_display, say_notes
+    from cli.console import out as console
+    from predmapnet.datasets.bags.conversion import BagOptions, log_from_bag
+
+    options = BagOptions(tuple(camera_topics or ()), base_frame, poses, height)
+    with progress_display() as display:
+        report = log_from_bag(bag, out, options, display.preparing)
+    if as_json:
+        print_json(asdict(report))
+    else:
+        for name, topic in report.cameras.items():
+            console.print(f"{name}: {counted(report.images[name], 'image')} of {topic}", markup=False)
+        console.print(f"poses: {report.poses}", markup=False)
+        console.print(f"written: {report.written} (check it: predmapnet scenes --check {report.written})", markup=False)
+    say_notes(report.notes, {})

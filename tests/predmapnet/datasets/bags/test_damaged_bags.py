@@ -1,0 +1,94 @@
+"""Of damaged bags, what can be read becomes a log, and what was lost is said."""
+
+import random
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from predmapnet.datasets.bags.conversion import log_from_bag
+from predmapnet.datasets.bags.storage import ZSTD
+from predmapnet.datasets.own_logs.scene import LogScene
+from predmapnet.errors import UserError
+from tests.predmapnet.datasets.bags.drawn_bag import compressed
+
+LEFT = "/sensing/left/image_raw/compressed"
+
+
+def images(folder) -> int:
+    return len(list(folder.glob("images/*/*")))
+
+
+@pytest.fixture
+def long(drawn):
+    """The drawn bag with images as large as to need several chunks of a bag."""
+    for topic, _, message in drawn.messages:
+        if topic.endswith("compressed"):
+            message.data = np.concatenate([message.data, np.random.default_rng(0).integers(0, 255, 300_000, np.uint8)])
+    return drawn
+
+
+@pytest.mark.parametrize(("storage", "compression"), [("mcap", "none"), ("mcap", "storage"), ("sqlite3", "none")])
+def test_a_bag_that_is_cut_off_is_used_as_far_as_it_goes(long, tmp_path, storage, compression):
+    bag = long.write(tmp_path / "bag", storage, compression)
+    (file,) = (path for path in bag.iterdir() if path.suffix != ".yaml")
+    whole = file.read_bytes()
+    found = []
+    for number, share in enumerate((0.4, 0.7, 0.95)):
+        file.write_bytes(whole[: int(share * len(whole))])
+        report = log_from_bag(bag, tmp_path / f"out_{number}")
+        assert any(file.name in note and "lost" in note for note in report.notes)
+        found.append(images(tmp_path / f"out_{number}"))
+    assert 0.2 * 24 < found[0] < found[1] < found[2] <= 24
+    assert found[2] >= 18
+
+
+@pytest.mark.parametrize("compression", ["storage", "none"])
+def test_a_damaged_stretch_costs_itself_alone(long, tmp_path, compression):
+    bag = long.write(tmp_path / "bag", "mcap", compression)
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[3].chunk_start_offset
+    data = bytearray(file.read_bytes())
+    # A compressed one cannot be opened; the checksum of the other one is wrong.
+    begin = data.index(ZSTD, chunk) if compression == "storage" else chunk + 9 + 24
+    data[begin : begin + 4] = b"\1\2\3\4"
+    file.write_bytes(data)
+    report = log_from_bag(bag, tmp_path / "out")
+    assert 16 <= images(tmp_path / "out") < 24
+    assert any("1 damaged chunks" in note for note in report.notes), report.notes
+
+
+def test_damaged_messages_and_images_are_counted(drawn, tmp_path):
+    left = drawn.of(LEFT)
+    left[0][2].data = left[0][2].data[:-200]
+    left[3][2].data = left[3][2].data[:-200]
+    time = left[5][1]
+    drawn.messages.append((LEFT, time, compressed(b"", time - 5, "left_optical")))
+    report = log_from_bag(drawn.write(tmp_path / "bag"), tmp_path / "out")
+    assert any(f"3 damaged messages of {LEFT}: the image is cut short" in note for note in report.notes)
+    assert images(tmp_path / "out") == 22
+    assert len(LogScene(tmp_path / "out")) > 0
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_bytes_that_changed_end_in_a_log_or_in_one_message(drawn, tmp_path, storage):
+    bag = drawn.write(tmp_path / "bag", storage)
+    (file,) = (path for path in bag.iterdir() if path.suffix != ".yaml")
+    whole, choice = file.read_bytes(), random.Random(1)
+    outcomes = set()
+    for number in range(40):
+        data = bytearray(whole)
+        for _ in range(choice.choice((1, 4, 40))):
+            data[choice.randrange(len(data))] = choice.randrange(256)
+        del data[choice.randrange(len(data) // 2, 2 * len(data)) :]
+        file.write_bytes(data)
+        try:
+            log_from_bag(bag, tmp_path / f"out_{number}")
+            outcomes.add("log")
+        except UserError as error:
+            outcomes.add("message")
+            assert "Traceback" not in str(error)
+            assert not (tmp_path / f"out_{number}").exists()
+    assert "log" in outcomes
+    assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
