@@ -14,10 +14,11 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from numba import njit
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.ground_truth.raster import Mask, mask_iou
+from predmapnet.datasets.ground_truth.raster import Mask, packed, packed_iou
 from predmapnet.evaluation.frames import EvaluationFrame
 
 Axes = Literal["mapvr", "ego"]
@@ -142,37 +143,48 @@ def _draw(polylines: Sequence[Float], kind: ElementKind, roi: RegionOfInterest, 
     columns, rows = np.rint(size * PIXELS_PER_METRE).astype(int)
     masks = np.zeros((len(polylines), rows, columns), dtype=np.uint8)
     square = np.ones((DILATION, DILATION), dtype=np.uint8)
-    for mask, points in zip(masks, polylines, strict=True):
-        oriented = points if axes == "ego" else np.stack([-points[:, 1], points[:, 0]], axis=1)
-        pixels = np.around((oriented + size / 2) * PIXELS_PER_METRE).astype(np.int32)
+    together = np.concatenate(polylines)
+    oriented = together if axes == "ego" else np.stack([-together[:, 1], together[:, 0]], axis=1)
+    pixels = np.around((oriented + size / 2) * PIXELS_PER_METRE).astype(np.int32)
+    starts = np.cumsum([0, *(len(points) for points in polylines[:-1])])
+    # Only the part of the canvas around an element is drawn on and dilated.
+    lows = np.maximum(np.minimum.reduceat(pixels, starts) - DILATION, 0)
+    highs = np.maximum(np.maximum.reduceat(pixels, starts) + DILATION, 0)
+    for mask, line, low, high in zip(masks, np.split(pixels, starts[1:]), lows, highs, strict=True):
+        part = mask[low[1] : high[1], low[0] : high[0]]
+        if part.size == 0:
+            continue
         if kind.is_ring:
-            cv2.fillPoly(mask, [pixels], color=1)
+            cv2.fillPoly(part, [line - low], color=1)
         else:
-            cv2.polylines(mask, [pixels], isClosed=False, color=1, thickness=1)
-        cv2.dilate(mask, square, dst=mask)
+            cv2.polylines(part, [line - low], isClosed=False, color=1, thickness=1)
+        cv2.dilate(part, square, dst=part)
     return masks
 
 
 def _overlaps(predicted: Mask, truths: Mask) -> tuple[Float, float]:
     """Overlap of every pair ``(n, m)``, and of the two unions."""
-    first, second = predicted.reshape(len(predicted), -1), truths.reshape(len(truths), -1)
-    both = mask_iou(first.max(axis=0, keepdims=True), second.max(axis=0, keepdims=True))
-    return mask_iou(first, second), float(both[0, 0])
+    first, second = packed(predicted.reshape(len(predicted), -1)), packed(truths.reshape(len(truths), -1))
+    both = packed_iou(np.bitwise_or.reduce(first)[None], np.bitwise_or.reduce(second)[None])
+    return packed_iou(first, second), float(both[0, 0])
 
 
-def _match(iou: Float, thresholds: Float) -> Integer:
+@njit(cache=True)
+def _match(iou: Float, thresholds: Float) -> Integer:  # pragma: no cover - compiled
     """COCO matching in score order: ``(t, n)`` index of the best truth still free (last among equals), or -1."""
     count, truths = iou.shape
     matches = np.full((len(thresholds), count), -1, dtype=np.int64)
-    if truths == 0:
-        return matches
-    free = np.ones((len(thresholds), truths), dtype=bool)
-    for row in range(count):
-        allowed = np.where(free & (iou[row] >= thresholds[:, None]), iou[row], -1.0)
-        best = truths - 1 - allowed[:, ::-1].argmax(axis=1)
-        hit = np.flatnonzero(allowed[np.arange(len(thresholds)), best] >= 0.0)
-        matches[hit, row] = best[hit]
-        free[hit, best[hit]] = False
+    for step in range(len(thresholds)):
+        free = np.ones(truths, dtype=np.bool_)
+        for row in range(count):
+            best = -1
+            for column in range(truths):
+                overlap = iou[row, column]
+                if free[column] and overlap >= thresholds[step] and (best < 0 or overlap >= iou[row, best]):
+                    best = column
+            if best >= 0:
+                matches[step, row] = best
+                free[best] = False
     return matches
 
 

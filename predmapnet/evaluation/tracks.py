@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapfusion.arrays import Float, Integer
+from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
 from predmapnet.datasets.ground_truth.raster import Mask, instance_masks
 from predmapnet.datasets.ground_truth.tracks import (
@@ -103,8 +103,8 @@ def form_tracks(frames: Sequence[EvaluationFrame]) -> list[FormedTracks]:
         taken: list[set[int]] = [set() for _ in ElementKind]
         order: list[list[int]] = [[] for _ in ElementKind]
         for instant, past_ids in reversed(past):
-            partner = _partners(instant, current, frame.predicted.roi)
-            for row in np.flatnonzero((ids < 0) & (partner >= 0)):
+            partner = _partners(instant, current, ids < 0, frame.predicted.roi)
+            for row in np.flatnonzero(partner >= 0):
                 kind, candidate = kinds[row], int(past_ids[partner[row]])
                 if candidate not in taken[kind]:
                     ids[row] = candidate
@@ -137,13 +137,17 @@ def _draw(kind: ElementKind, normalised: Float, roi: RegionOfInterest) -> Mask:
     return instance_masks(kind, from_normalised(normalised, roi), roi)
 
 
-def _partners(previous: _Instant, current: _Instant, roi: RegionOfInterest) -> Integer:
-    """Row of the earlier prediction that each current one continues, ``(n,)``, or -1."""
+def _partners(previous: _Instant, current: _Instant, wanted: Bool, roi: RegionOfInterest) -> Integer:
+    """Row of the earlier prediction that each wanted current one continues, ``(n,)``, or -1.
+
+    Those that are not wanted still compete, but kinds of which none is wanted are not drawn.
+    """
     partner = np.full(len(current.frame.kinds), -1, dtype=np.int64)
     for kind in ElementKind:
         before, now = previous.rows[kind], current.rows[kind]
-        if len(before) and len(now):
+        if len(before) and wanted[now].any():
             moved = warp(previous.frame.points[before], previous.frame, current.frame, roi, single_precision=False)
             old, new = match_masks(_draw(kind, moved, roi), current.masks[kind], PREDICTION_OVERLAP)
             partner[now[new]] = before[old]
+    partner[~wanted] = -1
     return partner

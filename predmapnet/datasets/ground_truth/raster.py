@@ -35,13 +35,14 @@ def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tupl
     size = roi.size.astype(points.dtype)
     pixels = (points + size / 2) / size * np.array(canvas, dtype=points.dtype)
     masks = np.zeros((len(points), canvas[1], canvas[0]), dtype=np.uint8)
-    for mask, line in zip(masks, pixels, strict=True):
-        if kind == ElementKind.PED_CROSSING:
+    polygons = kind == ElementKind.PED_CROSSING
+    for mask, line in zip(masks, pixels if polygons else pixels.astype(np.int32), strict=True):
+        if polygons:
             image = Image.new("L", canvas, 0)
-            ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in line], outline=1, fill=1)
+            ImageDraw.Draw(image).polygon(line.ravel().tolist(), outline=1, fill=1)
             mask[:] = np.asarray(image)
         else:
-            cv2.polylines(mask, [line.astype(np.int32)], False, 1, thickness=THICKNESS, lineType=cv2.LINE_8)
+            cv2.polylines(mask, [line], False, 1, thickness=THICKNESS, lineType=cv2.LINE_8)
         if cv2.countNonZero(mask) < SMALL_MASK:
             mask[:] = cv2.dilate(mask, _SMALL_MASK_KERNEL, iterations=1)
     return masks.reshape(len(points), canvas[0] * canvas[1])
@@ -49,19 +50,23 @@ def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tupl
 
 def mask_iou(first: Mask, second: Mask) -> Float:
     """Intersection over union of every pair of masks ``(n, pixels)`` and ``(m, pixels)``; 0 where both are empty."""
+    return packed_iou(packed(first), packed(second))
+
+
+def packed(masks: Mask) -> NDArray[np.uint64]:
+    """``(n, pixels)`` of 0 and 1 as ``(n, words)`` of 64 pixels each."""
+    bits = np.packbits(masks, axis=1)
+    words = np.zeros((len(bits), -(-bits.shape[1] // 8)), dtype=np.uint64)
+    words.view(np.uint8)[:, : bits.shape[1]] = bits
+    return words
+
+
+def packed_iou(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> Float:
+    """Intersection over union of every pair of :func:`packed` masks ``(n, words)`` and ``(m, words)``."""
     # Counting bits is several times as fast as a product of matrices, and starts no threads.
-    first_bits, second_bits = _packed(first), _packed(second)
-    together = np.bitwise_count(first_bits[:, None] & second_bits[None]).sum(axis=2, dtype=np.int64)
-    first_area = np.bitwise_count(first_bits).sum(axis=1, dtype=np.int64)
-    second_area = np.bitwise_count(second_bits).sum(axis=1, dtype=np.int64)
+    together = np.bitwise_count(first[:, None] & second[None]).sum(axis=2, dtype=np.int64)
+    first_area = np.bitwise_count(first).sum(axis=1, dtype=np.int64)
+    second_area = np.bitwise_count(second).sum(axis=1, dtype=np.int64)
     either = first_area[:, None] + second_area[None] - together
     iou: Float = np.divide(together, either, out=np.zeros(together.shape), where=either > 0)
     return iou
-
-
-def _packed(masks: Mask) -> NDArray[np.uint64]:
-    """``(n, pixels)`` of 0 and 1 as ``(n, words)`` of 64 pixels each."""
-    packed = np.packbits(masks, axis=1)
-    words = np.zeros((len(packed), -(-packed.shape[1] // 8)), dtype=np.uint64)
-    words.view(np.uint8)[:, : packed.shape[1]] = packed
-    return words
