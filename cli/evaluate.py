@@ -119,6 +119,7 @@ def evaluate(
     from predmapnet.evaluation.report import write_figures, write_report
     from predmapnet.evaluation.scene_figures import scene_figures
     from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, scenes_to_measure
+    from predmapnet.runs.place_maps import place_matches
 
     settings = EvaluationSettings(
         dataset=dataset,
@@ -145,7 +146,7 @@ def evaluate(
         for measurement in measure_scenes(settings, scenes, jobs, display.preparing):
             measured.append(measurement)
             display.scenes(len(measured), len(scenes))
-    total = pool_scenes(measured)
+    total = pool_scenes(measured, place_matches(source, measured))
     context = _context(source, total, found_split, in_split) | {
         "split_scheme": split_scheme.value,
         "official_frames": official_frames,
@@ -161,14 +162,14 @@ def evaluate(
         say_warning(text)
     if json_file is None and report is None:
         return
-    per_scene = {scene.frames[0].scene: scene_figures(scene) for scene in measured}
+    per_scene = {scene.name: scene_figures(scene) for scene in measured}
     if to_stdout:
         print_json({"evaluated": {"version": __version__, **context}, **figures, "per_scene": per_scene})
     elif json_file is not None:
         write_figures(json_file, {**figures, "per_scene": per_scene}, context)
         out.print(f"written: {json_file}", markup=False)
     if report is not None:
-        maps = {scene.frames[0].scene: scene.maps for scene in measured if scene.maps is not None}
+        maps = {scene.name: scene.maps for scene in measured if scene.maps is not None}
         write_report(report, total, context, per_scene, _origin(results, weights, total), maps)
         out.print(f"written: {report}", markup=False)
 
@@ -264,7 +265,10 @@ def _table(figures: dict[str, Any]) -> Table:
         for key, text, digits in _GLOBAL_ROWS:
             _add(table, text, whole[key], [whole[kind][key] for kind in KINDS], digits)
         _add(table, "map element AP", whole["element_mAP"], [whole[kind]["element_AP"] for kind in KINDS])
-        _add_precisions(table, "global AP (GlobalMapNet)", figures["global_map_ap"])
+        _add_precisions(table, "global AP, single scenes", figures["global_map_ap"])
+    places = figures["place_map_ap"]
+    if places is not None:
+        _add_precisions(table, f"global AP, {counted(places['places'], 'place')}", places)
     return table
 
 

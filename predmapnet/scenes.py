@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 Image = NDArray[np.uint8]
 Progress = Callable[[int, int, str], None]
 """Callback ``progress(done, total, what)`` of a long preparation."""
+
+STANDARD_REGION = RegionOfInterest()
+"""Region of most benchmarks, 60 m x 30 m."""
 
 NARROW_GAP = 4.0
 """Gaps between neighbouring cameras narrower than this, metres, count as seen from either side."""
@@ -187,8 +190,8 @@ class Scene(Protocol):
     def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
         """Return the ground truth of all frames, kept in the folder ``cache`` if one is given; None without a map."""
 
-    def truth_map(self) -> GlobalMap | None:
-        """Return the ground-truth map of the whole log in the global frame, unclipped, or None."""
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
+        """Return the true map of what came into the region along the log, global frame; None without a map."""
 
 
 class SceneSource(Protocol):
@@ -211,6 +214,9 @@ class SceneSource(Protocol):
 
     def open(self, scene: str, progress: Progress | None = None) -> Scene:
         """Open one scene by name; a name that does not exist raises UserError with the nearest names."""
+
+    def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true map of what came into the region along several scenes of one location, or None."""
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to: names of scenes by frame token. Unknown tokens are absent."""

@@ -32,7 +32,7 @@ from predmapnet.datasets.argoverse2_frames import (
 )
 from predmapnet.datasets.fields import check_principal_point, whole_field
 from predmapnet.datasets.georeference import argoverse2_georeference
-from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
+from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth, united_map
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.whole_map import truth_map
 from predmapnet.datasets.lidar import read_argoverse2_sweep
@@ -40,7 +40,7 @@ from predmapnet.datasets.log_checks import check_cameras, check_clock, check_dri
 from predmapnet.datasets.poses import pose_matrix
 from predmapnet.datasets.splits import SPLITS, check_scheme, check_split, split_names
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
+from predmapnet.scenes import STANDARD_REGION, Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
 
 KEY_FRAME_STRIDE = 4
 """Every fourth lidar sweep of 10 Hz is a key frame (2.5 Hz), as in the official vector-map data sets."""
@@ -191,6 +191,16 @@ class Argoverse2Source:
             raise UserError(f"{self.root} holds no log '{scene}' among its {len(self._logs)} logs.{hint}")
         return Argoverse2Scene(self._logs[matches[0]], self._info(matches[0]), self._key_frames(matches[0]))
 
+    def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true map of what came into the region along logs of one city; None if one has no map."""
+        opened = [self.open(name) for name in scenes]
+        files = [scene.map_file for scene in opened]
+        known = [file for file in files if file is not None]
+        if len(known) < len(files):
+            return None
+        truth = Argoverse2GroundTruth(united_map(known))
+        return truth_map(truth, [pose for scene in opened for pose in scene.way()], roi)
+
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which logs frames belong to; unknown tokens are absent.
 
@@ -320,8 +330,12 @@ class Argoverse2Scene:
     @cached_property
     def ground_truth(self) -> Argoverse2GroundTruth | None:
         """The log's vector map, or None if it has none."""
-        maps = sorted((self._folder / "map").glob("log_map_archive_*.json"))
-        return Argoverse2GroundTruth(maps[0]) if maps else None
+        return None if self.map_file is None else Argoverse2GroundTruth(self.map_file)
+
+    @property
+    def map_file(self) -> Path | None:
+        """File of the log's vector map, or None if it has none."""
+        return next(iter(sorted((self._folder / "map").glob("log_map_archive_*.json"))), None)
 
     def truth(self, index: int, roi: RegionOfInterest) -> FrameTruth | None:
         """Return the official ground truth of frame ``index``, or None for a log without a map."""
@@ -334,12 +348,13 @@ class Argoverse2Scene:
         poses = [self.pose(index) for index in range(len(self))]
         return all_truths(self.ground_truth, poses, roi, cache, "argoverse2")
 
-    def truth_map(self) -> GlobalMap | None:
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
         """Return the true map of this log, as a perfect mapper would make it; None for a log without a map."""
-        if self.ground_truth is None:
-            return None
-        frames = [(int(self.timestamps[index]), self.pose(index)) for index in range(len(self))]
-        return truth_map(self.ground_truth, frames, RegionOfInterest())
+        return None if self.ground_truth is None else truth_map(self.ground_truth, self.way(), roi)
+
+    def way(self) -> list[tuple[int, Float]]:
+        """Return time stamp and ``ego_to_global`` of all frames."""
+        return [(int(timestamp), self.pose(index)) for index, timestamp in enumerate(self.timestamps)]
 
 
 def _nearest(times: Integer, files: Sequence[Path], timestamp: int) -> Path | None:

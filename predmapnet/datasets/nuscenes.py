@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from predmapnet.datasets.nuscenes_tables import LIDAR, NUSCENES_CAMERAS, Tables,
 from predmapnet.datasets.poses import combined, pose_matrix
 from predmapnet.datasets.splits import check_scheme, check_split, split_names
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
+from predmapnet.scenes import STANDARD_REGION, Camera, Frame, FrameTruth, Instant, Progress, Rig, SceneInfo
 
 OLD_SPLIT = {"train": "nuscenes_old_train", "val": "nuscenes_old_val", "test": "nuscenes_test"}
 OLD_MINI_SPLIT = {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"}
@@ -121,6 +121,12 @@ class NuScenesSource:
         info = self._info(scene)
         truth = partial(self._ground_truth, info.location)
         return NuScenesScene(self.root, self.tables, info, truth, self._georeference(info))
+
+    def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true map of what came into the region along scenes of one location; None without an expansion."""
+        opened = [self.open(name) for name in scenes]
+        truth = opened[0].ground_truth
+        return None if truth is None else truth_map(truth, [pose for scene in opened for pose in scene.way()], roi)
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to, by sample token; unknown tokens are absent."""
@@ -370,12 +376,13 @@ class NuScenesScene:
         poses = [self.lidar_to_global(index) for index in range(len(self))]
         return all_truths(self.ground_truth, poses, roi, cache, "nuscenes")
 
-    def truth_map(self) -> GlobalMap | None:
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
         """Return the true map of this scene, as a perfect mapper would make it; None without a map expansion."""
-        if self.ground_truth is None:
-            return None
-        frames = [(self._frames[index].timestamp, self.lidar_to_global(index)) for index in range(len(self))]
-        return truth_map(self.ground_truth, frames, RegionOfInterest())
+        return None if self.ground_truth is None else truth_map(self.ground_truth, self.way(), roi)
+
+    def way(self) -> list[tuple[int, Float]]:
+        """Return time stamp and ``lidar_to_global`` of all frames."""
+        return [(frame.timestamp, self.lidar_to_global(index)) for index, frame in enumerate(self._frames)]
 
 
 def _pose(record: Record, where: str) -> Float:

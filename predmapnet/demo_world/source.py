@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.nuscenes import NuScenesScene, NuScenesSource
 from predmapnet.demo_world.catalogue import WORLD_VERSION, default_cache, ensure_scene, scene_folder, scene_infos
 from predmapnet.errors import UserError
@@ -51,6 +52,11 @@ class DemoSource:
             )
         written.info = dataclasses.replace(info, ready=True)
         return written
+
+    def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true map of one scene: each has a town of its own."""
+        (scene,) = scenes
+        return self.open(scene).truth_map(roi)
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to, among those that have been rendered; unknown tokens are absent."""

@@ -52,7 +52,7 @@ class SceneMeasurement:
         mapping_seconds: wall time of mapping; None where results were read.
         absent_frames: frames that the results lack, measured as empty ones.
         weights_sha256: of the weights that made the maps; None where unknown.
-        maps: the map of the drive and the true one, for drawings; None where one is missing.
+        maps: the map of the drive and the true one; None where there is no true one.
     """
 
     frames: tuple[EvaluationFrame, ...]
@@ -76,6 +76,11 @@ class SceneMeasurement:
     weights_sha256: str | None = None
     maps: tuple[GlobalMap, GlobalMap] | None = None
 
+    @property
+    def name(self) -> str:
+        """Name of the scene."""
+        return self.frames[0].scene
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -96,6 +101,7 @@ class Measurement:
     stability: Stability
     global_map: GlobalMapQuality | None
     global_map_ap: AveragePrecision | None
+    place_map_ap: AveragePrecision | None
     frames_per_second: float | None
     absent_frames: int
     weights_sha256: str | None
@@ -121,9 +127,12 @@ class Measurement:
                 f"no ground truth of {', '.join(absent)}: counts as 0 in every mean over the kinds but raster's"
             )
         if not self.has_tracks:
-            found.append("no track ids: consistency AP is of ids formed afterwards, and there is no map of the drive")
-        elif self.global_map is None:
-            found.append("no map of the drive for some scenes: they have no tracked element or no true map")
+            found.append(
+                "no track ids: consistency AP is of ids formed afterwards, and elements of a score of at least 0.4 are "
+                "fused into the map of the drive by where they lie"
+            )
+        if self.global_map is None:
+            found.append("no true map of some scenes, so no figures of the map of the drive")
         if not len(self.forecast.errors[0]):
             found.append("no forecasts")
         return found
@@ -154,6 +163,7 @@ class Measurement:
             "stability": self.stability.figures(),
             "global_map": None if self.global_map is None else self.global_map.figures(),
             "global_map_ap": None if self.global_map_ap is None else self.global_map_ap.figures(),
+            "place_map_ap": None if self.place_map_ap is None else _of_places(self.place_map_ap),
             "forecast": self.forecast.figures(),
             "tracks": self.identity.figures(),
         }
@@ -200,9 +210,10 @@ def measure_scene(
     )
 
 
-def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
+def pool_scenes(scenes: Sequence[SceneMeasurement], places: Sequence[Matches] | None = None) -> Measurement:
     """Pool scenes (at least one); their order breaks ties of scores.
 
+    ``places`` are the matches of one global map per location, see :func:`predmapnet.runs.place_maps.place_matches`.
     Raises UserError where they were mapped with different regions of interest or weights.
     """
     if not scenes:
@@ -222,7 +233,7 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
         return accumulate(matches, at)
 
     return Measurement(
-        scenes=tuple(scene.frames[0].scene for scene in scenes),
+        scenes=tuple(scene.name for scene in scenes),
         frames=tuple(frames),
         chamfer=pooled("chamfer"),
         frechet=pooled("frechet", FRECHET_THRESHOLDS),
@@ -237,10 +248,15 @@ def pool_scenes(scenes: Sequence[SceneMeasurement]) -> Measurement:
         stability=stability([(scene.frames, scene.instances) for scene in scenes], scenes[0].protocol),
         global_map=pool(maps) if len(maps) == len(scenes) else None,
         global_map_ap=accumulate(global_matches, thresholds) if len(global_matches) == len(scenes) else None,
+        place_map_ap=None if places is None else accumulate(places, thresholds),
         frames_per_second=len(frames) / sum(seconds) if len(seconds) == len(scenes) else None,
         absent_frames=sum(scene.absent_frames for scene in scenes),
         weights_sha256=scenes[0].weights_sha256,
     )
+
+
+def _of_places(result: AveragePrecision) -> dict[str, Any]:
+    return {"places": len(result.flags), **result.figures()}
 
 
 def _element_ids(frames: Sequence[EvaluationFrame], track_ids: Sequence[Integer]) -> list[Integer]:

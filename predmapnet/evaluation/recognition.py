@@ -10,9 +10,9 @@ import numpy as np
 from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from predmapnet.errors import UserError
-from predmapnet.scenes import SceneInfo
+from predmapnet.scenes import STANDARD_REGION, SceneInfo
 
-STANDARD, WIDE = RegionOfInterest(60.0, 30.0), RegionOfInterest(100.0, 50.0)
+STANDARD, WIDE = STANDARD_REGION, RegionOfInterest(100.0, 50.0)
 """Regions of the benchmarks."""
 OVERSHOOT = 1.0
 """Metres by which an element may leave its region."""

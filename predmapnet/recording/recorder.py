@@ -72,7 +72,7 @@ class SceneRecorder:
         way = np.array([scene.instant(index).ego_to_global[:2, 3] for index in range(len(scene))])
         self._origin = way[0]
         self._pictures = Pictures(scene.rig)
-        truth = scene.truth_map()
+        truth = scene.truth_map(roi)
         extent = Extent.of(way - self._origin, float(roi.width))
         self._content = Content(extent, truth is not None, self._place is not None)
         rec.send_blueprint(scene_blueprint(scene.rig, BEV_SHAPE, self._content, self._live))

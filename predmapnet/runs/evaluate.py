@@ -22,6 +22,7 @@ from predmapnet.frame_files.parquet import read_frames, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
 from predmapnet.machine import NetworkOptions, use_threads
 from predmapnet.mapping import NETWORK_ERRORS
+from predmapnet.runs.integrate import with_own_ids
 from predmapnet.runs.process_executor import ProcessExecutor
 from predmapnet.scenes import Instant, Progress, Scene, SceneSource
 from predmapnet.sources import open_source
@@ -143,7 +144,7 @@ def _measure(
 
         run = map_scene(scene, _mapper(settings))
         frames = _with_truth(scene, run.frame_maps, settings.cache)
-        truth_map = scene.truth_map()
+        truth_map = scene.truth_map(frames[0].predicted.roi)
         measured = measure_scene(frames, run.global_map, truth_map, run.seconds, settings.protocol)
         maps = _pair(run.global_map, truth_map)
         return replace(measured, weights_sha256=_mapper(settings).weights_sha256, maps=maps)
@@ -152,14 +153,14 @@ def _measure(
     else:
         found = _stored_maps(settings.results, scene, _source(settings).name)
     frames = _with_truth(scene, found.maps, settings.cache)
-    global_map, truth_map = _integrated(name, found.maps), scene.truth_map()
+    global_map, truth_map = _integrated(name, found.maps), scene.truth_map(frames[0].predicted.roi)
     measured = measure_scene(frames, global_map, truth_map, protocol=settings.protocol)
     maps = _pair(global_map, truth_map)
     return replace(measured, absent_frames=found.absent, weights_sha256=found.weights_sha256, maps=maps)
 
 
-def _pair(global_map: GlobalMap | None, truth_map: GlobalMap | None) -> tuple[GlobalMap, GlobalMap] | None:
-    return None if global_map is None or truth_map is None else (global_map, truth_map)
+def _pair(global_map: GlobalMap, truth_map: GlobalMap | None) -> tuple[GlobalMap, GlobalMap] | None:
+    return None if truth_map is None else (global_map, truth_map)
 
 
 @dataclass(frozen=True)
@@ -282,10 +283,10 @@ def _at(
     return stored
 
 
-def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap | None:
-    """Fuse frames as mapping does; None if nothing is tracked."""
+def _integrated(name: str, frame_maps: Sequence[FrameMap]) -> GlobalMap:
+    """Fuse frames as mapping does, or as ``predmapnet integrate`` does where nothing is tracked."""
     if not any((frame_map.track_ids >= 0).any() for frame_map in frame_maps):
-        return None
+        frame_maps = with_own_ids(frame_maps)
     integrator = MapIntegrator(NETWORK_ERRORS)
     for frame_map in frame_maps:
         integrator.add(frame_map, log=name)

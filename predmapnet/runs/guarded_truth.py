@@ -9,7 +9,7 @@ from typing import TypeVar
 from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.georeference import Georeference
-from predmapnet.scenes import Frame, FrameTruth, Instant, Rig, Scene, SceneInfo
+from predmapnet.scenes import STANDARD_REGION, Frame, FrameTruth, Instant, Rig, Scene, SceneInfo
 
 Found = TypeVar("Found")
 
@@ -59,9 +59,9 @@ class GuardedTruth:
         """Return the ground truth of all frames; None without one or if it cannot be had."""
         return self.guarded(lambda: self._scene.truths(roi, cache))
 
-    def truth_map(self) -> GlobalMap | None:
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
         """Return the ground-truth map of the whole log; None without one or if it cannot be had."""
-        return self.guarded(self._scene.truth_map)
+        return self.guarded(lambda: self._scene.truth_map(roi))
 
     def guarded(self, ask: Callable[[], Found | None]) -> Found | None:
         """Return what ``ask`` finds, or None after a failure, which is kept as :attr:`problem`."""

@@ -305,7 +305,7 @@ def _check_place(crs: str, georeference: Georeference, scene: Scene) -> None:
 
 def measure(scene: Scene, run: SceneRun, roi: RegionOfInterest) -> Accuracy | None:
     """Compare a run with the ground truth of its scene; None where there is none."""
-    truth_map = scene.truth_map()
+    truth_map = scene.truth_map(roi)
     if truth_map is None:
         return None
     frames = []

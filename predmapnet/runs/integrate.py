@@ -22,6 +22,9 @@ from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_
 from predmapnet.mapping import NETWORK_ERRORS, check_left_out
 from predmapnet.runs.gaps import empty_sentence
 
+UNTRACKED_SCORE = 0.4
+"""Score from which elements without track ids are used."""
+
 NAMED = 3
 """Number of tokens that a message names."""
 
@@ -61,7 +64,7 @@ def integrate_file(
     frames: Path,
     poses: Path | None = None,
     roi: RegionOfInterest | None = None,
-    min_score: float = 0.4,
+    min_score: float = UNTRACKED_SCORE,
     y_forward: bool = False,
     normalised: bool = False,
     correct: bool = False,
@@ -166,17 +169,18 @@ def _placed(
             f"{frames_path.name} has no track ids: elements with a score of at least {min_score:g} are used, "
             "and put together by where they lie"
         )
-    next_track = 0
-    logged = []
-    for pose in poses.values():
-        frame = seen.get(pose.token, NOTHING)
-        if not tracked:
-            count = len(frame.kinds)
-            ids = np.where(frame.scores >= min_score, next_track + np.arange(count), -1)
-            frame = replace(frame, track_ids=ids)
-            next_track += count
-        logged.append(LoggedFrame(pose.scene, frame.at(pose, roi)))
-    return logged
+    placed = [seen.get(pose.token, NOTHING).at(pose, roi) for pose in poses.values()]
+    maps = placed if tracked else with_own_ids(placed, min_score)
+    return [LoggedFrame(pose.scene, frame_map) for pose, frame_map in zip(poses.values(), maps, strict=True)]
+
+
+def with_own_ids(frame_maps: Sequence[FrameMap], min_score: float = UNTRACKED_SCORE) -> list[FrameMap]:
+    """Give each element with at least this score an id of its own, so that it is fused by where it lies."""
+    first = np.cumsum([0, *(len(frame_map) for frame_map in frame_maps)])
+    return [
+        replace(each, track_ids=np.where(each.scores >= min_score, start + np.arange(len(each)), -1))
+        for each, start in zip(frame_maps, first, strict=False)
+    ]
 
 
 def _by_name(submitted: Mapping[str, SubmittedFrame], poses: Mapping[str, FramePose]) -> dict[str, FramePose]:

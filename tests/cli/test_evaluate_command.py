@@ -10,6 +10,7 @@ import pytest
 from mapfusion.elements import FrameMap, RegionOfInterest
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.frame_files.parquet import StoredFrame, write_frames
+from tests.cli.tiny_nuscenes import edit_table
 
 ROI = RegionOfInterest()
 
@@ -88,6 +89,33 @@ def test_the_truth_as_results_is_perfect_in_parquet_and_as_a_submission(predmapn
         assert figures["chamfer_ap"]["mAP"] == pytest.approx(len(present) / 3)
         assert figures["raster_ap"]["mAP"] == pytest.approx(1.0)
         assert figures["consistency_ap"]["mAP"] == pytest.approx(len(present) / 3)
+        # Elements without ids are fused by where they lie, and the map of the drive is measured, too.
+        assert figures["global_map"]["f1@1.0"] > 0.95
+        assert figures["global_map_ap"] == {k: v for k, v in figures["place_map_ap"].items() if k != "places"}
+
+
+def test_scenes_of_one_place_are_measured_as_one_map(predmapnet, tiny_root, tmp_path):
+    """Both scenes pass the same road: together they are one map, which has each true element once."""
+
+    def onto_the_same_road(poses):
+        for pose in poses:
+            x, y, z = pose["translation"]
+            pose["translation"] = [x + 20.0, 500.0, z] if y == 600.0 else [x, y, z]
+
+    edit_table(tiny_root, "ego_pose", onto_the_same_road)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("scene-0001", "scene-0002"):
+        write_frames(folder / f"{name}.parquet", stored(truth_as_results(tiny_root, name)[1], name), {})
+    result = predmapnet("evaluate", folder, "--data-root", tiny_root, "--json", tmp_path / "f.json")
+    assert result.code == 0, result.err
+    assert "global AP, 1 place" in result.out and "global AP, single scenes" in result.out
+    figures = json.loads((tmp_path / "f.json").read_text())
+    single, across = figures["global_map_ap"]["boundary"], figures["place_map_ap"]["boundary"]
+    assert figures["place_map_ap"]["places"] == 1
+    assert (single["truths"], single["predictions"]) == (4, 4)
+    assert (across["truths"], across["predictions"]) == (2, 2)
+    assert across["AP"] == pytest.approx(1.0)
 
 
 def test_the_new_split_measures_other_scenes(predmapnet, tiny_root, tmp_path):

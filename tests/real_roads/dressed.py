@@ -26,7 +26,7 @@ from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.world import CrossingStyle, Look, Trajectory, VectorMap
 from predmapnet.files import write_file
 from predmapnet.machine import available_cores
-from predmapnet.scenes import Camera, FrameTruth, Rig, Scene
+from predmapnet.scenes import STANDARD_REGION, Camera, FrameTruth, Rig, Scene
 from tests.real_roads.argoverse_logs import read_log
 from tests.real_roads.road_maps import Truth, drives_along, read_road_map, truth_along
 from tests.real_roads.scene_views import ChosenFrames, moved_rig
@@ -145,7 +145,7 @@ class DressedScene(ChosenFrames):
         """Return the truth of the frames; nothing is kept in ``cache``."""
         return [self.known.frame(row, roi) for row in self.truth_rows]
 
-    def truth_map(self) -> GlobalMap | None:
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
         return self.known.whole()
 
 

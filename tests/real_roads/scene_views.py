@@ -7,7 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
-from predmapnet.scenes import Camera, Float, Frame, FrameTruth, Georeference, Instant, Rig, Scene, SceneInfo
+from predmapnet.scenes import (
+    STANDARD_REGION,
+    Camera,
+    Float,
+    Frame,
+    FrameTruth,
+    Georeference,
+    Instant,
+    Rig,
+    Scene,
+    SceneInfo,
+)
 
 
 class SceneView:
@@ -46,8 +57,8 @@ class SceneView:
     def truths(self, roi: RegionOfInterest, cache: Path | None = None) -> list[FrameTruth] | None:
         return self.scene.truths(roi, cache)
 
-    def truth_map(self) -> GlobalMap | None:
-        return self.scene.truth_map()
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
+        return self.scene.truth_map(roi)
 
 
 class ChosenFrames(SceneView):

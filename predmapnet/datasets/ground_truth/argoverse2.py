@@ -209,6 +209,23 @@ class Argoverse2GroundTruth:
         ]
 
 
+def united_map(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
+    """Unite the vector maps of several logs of one city, which hold the same record by the same id.
+
+    Drivable areas are all kept, since logs hold what is near to them; where they overlap they are one surface anyway.
+    """
+    united: dict[str, dict[str, Any]] = {"lane_segments": {}, "pedestrian_crossings": {}, "drivable_areas": {}}
+    for file in files:
+        content, digest = read_map_file(file)
+        for layer, records in united.items():
+            found = content.get(layer)
+            if not isinstance(found, Mapping):
+                raise UserError(f"{file} is not an Argoverse 2 vector map: it lacks {layer}. Fetch the log again.")
+            own = digest.hex() if layer == "drivable_areas" else ""
+            records.update({f"{own}{name}": record for name, record in found.items()})
+    return united
+
+
 def _side(lane: Mapping[str, Any], points: Float, which: str) -> LaneSide | None:
     neighbour = lane[f"{which}_neighbor_id"]
     if neighbour is None:

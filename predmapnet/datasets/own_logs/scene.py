@@ -21,7 +21,7 @@ from predmapnet.datasets.own_logs.pose_files import read_timed_poses
 from predmapnet.datasets.own_logs.timed_poses import TimedPoses
 from predmapnet.datasets.own_logs.truth import Lines, read_truth, truth_around, truth_of_drive
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera, Frame, FrameTruth, Instant, Rig, SceneInfo
+from predmapnet.scenes import STANDARD_REGION, Camera, Frame, FrameTruth, Instant, Rig, SceneInfo
 
 RATE = 2.0
 """Frames a second: as the shipped network was trained."""
@@ -153,7 +153,7 @@ class LogScene:
         found = (self.truth(index, roi) for index in range(len(self)))
         return None if self._lines is None else [truth for truth in found if truth is not None]
 
-    def truth_map(self) -> GlobalMap | None:
+    def truth_map(self, roi: RegionOfInterest = STANDARD_REGION) -> GlobalMap | None:
         """Return the true lines of the whole drive, or None."""
         return None if self._lines is None else truth_of_drive(self._lines, self.timestamps)
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.datasets.own_logs.calibration import CALIBRATION
 from predmapnet.datasets.own_logs.scene import RATE, LogScene
 from predmapnet.datasets.splits import SPLITS, check_split
@@ -68,6 +69,11 @@ class LogSource:
             hint = f" Did you mean {', '.join(near)}?" if near else ""
             raise UserError(f"{self.root} holds no log '{scene}' among its {len(self.folders)} logs.{hint}")
         return LogScene(self.folders[scene], self.rate, self._split(scene))
+
+    def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true lines of one log: logs of one's own have no location in common."""
+        (scene,) = scenes
+        return self.open(scene).truth_map(roi)
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which logs frames (``<log>_<timestamp>``) belong to; unknown tokens are absent."""

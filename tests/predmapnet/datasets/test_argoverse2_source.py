@@ -120,6 +120,26 @@ def test_truth_of_a_straight_road(log):
     assert truth.element_ids.tolist()[:2] == [0, 0]
 
 
+def test_the_maps_of_several_logs_are_one(log, tmp_path):
+    """The second log's map knows one more crossing and another part of the road; the same records count once."""
+    other = write_log(log.parent / "0bbb-log")
+    (file,) = (other / "map").glob("*.json")
+    content = json.loads(file.read_text())
+    more = {"edge1": [point(70, 0), point(70, 8)], "edge2": [point(73, 0), point(73, 8)]}
+    content["pedestrian_crossings"]["another"] = more
+    content["drivable_areas"] = {"1": {"area_boundary": [point(40, 0), point(140, 0), point(140, 8), point(40, 8)]}}
+    file.write_text(json.dumps(content))
+    source, roi = Argoverse2Source(tmp_path / "data"), RegionOfInterest()
+    names = ["0aaa-log", "0bbb-log"]
+    alone, both = source.open(names[0]).truth_map(), source.truth_map(names, roi)
+    assert len(both.of_kind(0)) == len(alone.of_kind(0)) + 1
+    for kind in (1, 2):
+        assert len(both.of_kind(kind)) == len(alone.of_kind(kind))
+        assert both.length(kind) == pytest.approx(alone.length(kind))
+    file.unlink()
+    assert source.truth_map(names, roi) is None
+
+
 def test_a_log_without_images_or_calibration_still_serves_truth(log):
     (log / "sensors" / "cameras").rename(log / "elsewhere")
     scene = Argoverse2Source(log).open("0aaa-log")

@@ -90,6 +90,24 @@ def test_the_map_of_the_whole_scene(nuscenes_root):
     assert truth.elements[1].observations == 3
 
 
+def test_the_map_of_a_wider_region_reaches_further(nuscenes_root):
+    truth = NuScenesSource(nuscenes_root).open("scene-0061").truth_map(RegionOfInterest(100.0, 50.0))
+    assert truth.length(1) == pytest.approx(110.0)
+
+
+def test_the_map_of_several_scenes_is_one(nuscenes_root):
+    """Both drive along the same road: no element comes twice, and each scene's frames count as observations."""
+    source, roi = NuScenesSource(nuscenes_root), RegionOfInterest()
+    alone, other = (source.open(name).truth_map() for name in ("scene-0061", "scene-0103"))
+    both = source.truth_map(["scene-0061", "scene-0103"], roi)
+    assert [len(both.of_kind(kind)) for kind in range(3)] == [1, 1, 2]
+    ends = [element.points[:, 0] for part in (alone, other) for element in part.of_kind(1)]
+    assert both.length(1) == pytest.approx(max(map(np.max, ends)) - min(map(np.min, ends)))
+    assert both.elements[1].observations == alone.elements[1].observations + other.elements[1].observations
+    (nuscenes_root / "maps").rename(nuscenes_root / "elsewhere")
+    assert NuScenesSource(nuscenes_root).truth_map(["scene-0061", "scene-0103"], roi) is None
+
+
 def test_a_rendered_data_set_is_synthetic_and_lies_in_the_ocean(nuscenes_root):
     real = NuScenesSource(nuscenes_root)
     assert not real.synthetic
