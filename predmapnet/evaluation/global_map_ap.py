@@ -2,11 +2,11 @@
 
 After GlobalMapNet (arXiv 2409.10063) and its public evaluation: the true map is cut by the union of the regions of
 interest along the drive, every element is 200 points, and matching and averaging are those of chamfer AP. Maps are
-matched one by one and ranked together: one map per scene gives the figure of single scenes, one map per place (that of
-all all its scenes, see :mod:`predmapnet.runs.place_maps`) the figure across scenes. Outlines of crossings are cut as lines, as there. GlobalMapNet updates its map
-in every fourth frame and cuts by those; here all frames of a drive cut. The true map is the one of
-:mod:`predmapnet.datasets.ground_truth.whole_map`, which joins dividers and merges crossings in its own way, so figures
-are comparable with each other, but not with those in the paper.
+matched one by one and ranked together: one map per scene gives the figure of single scenes, one map per place (see
+:mod:`predmapnet.runs.place_maps`) the figure across scenes. Outlines of crossings are cut as lines, as there.
+GlobalMapNet updates its map in every fourth frame and cuts by those; here all frames of a drive cut. The true map is
+the one of :mod:`predmapnet.datasets.ground_truth.whole_map`, which joins dividers and merges crossings in its own way,
+so figures are comparable with each other, but not with those in the paper.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from numba import njit
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, RegionOfInterest
-from predmapnet.datasets.ground_truth.raster import Mask, packed, packed_iou
+from predmapnet.datasets.ground_truth.raster import Mask, packed_bits, packed_iou
 from predmapnet.evaluation.frames import EvaluationFrame
 
 Axes = Literal["mapvr", "ego"]
@@ -164,7 +164,7 @@ def _draw(polylines: Sequence[Float], kind: ElementKind, roi: RegionOfInterest, 
 
 def _overlaps(predicted: Mask, truths: Mask) -> tuple[Float, float]:
     """Overlap of every pair ``(n, m)``, and of the two unions."""
-    first, second = packed(predicted.reshape(len(predicted), -1)), packed(truths.reshape(len(truths), -1))
+    first, second = packed_bits(predicted.reshape(len(predicted), -1)), packed_bits(truths.reshape(len(truths), -1))
     both = packed_iou(np.bitwise_or.reduce(first)[None], np.bitwise_or.reduce(second)[None])
     return packed_iou(first, second), float(both[0, 0])
 

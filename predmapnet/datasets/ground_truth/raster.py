@@ -50,10 +50,10 @@ def instance_masks(kind: int, points: Float, roi: RegionOfInterest, canvas: tupl
 
 def mask_iou(first: Mask, second: Mask) -> Float:
     """Intersection over union of every pair of masks ``(n, pixels)`` and ``(m, pixels)``; 0 where both are empty."""
-    return packed_iou(packed(first), packed(second))
+    return packed_iou(packed_bits(first), packed_bits(second))
 
 
-def packed(masks: Mask) -> NDArray[np.uint64]:
+def packed_bits(masks: Mask) -> NDArray[np.uint64]:
     """``(n, pixels)`` of 0 and 1 as ``(n, words)`` of 64 pixels each."""
     bits = np.packbits(masks, axis=1)
     words = np.zeros((len(bits), -(-bits.shape[1] // 8)), dtype=np.uint64)
@@ -62,7 +62,7 @@ def packed(masks: Mask) -> NDArray[np.uint64]:
 
 
 def packed_iou(first: NDArray[np.uint64], second: NDArray[np.uint64]) -> Float:
-    """Intersection over union of every pair of :func:`packed` masks ``(n, words)`` and ``(m, words)``."""
+    """Intersection over union of every pair of :func:`packed_bits` masks ``(n, words)`` and ``(m, words)``."""
     # Counting bits is several times as fast as a product of matrices, and starts no threads.
     together = np.bitwise_count(first[:, None] & second[None]).sum(axis=2, dtype=np.int64)
     first_area = np.bitwise_count(first).sum(axis=1, dtype=np.int64)
