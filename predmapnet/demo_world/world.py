@@ -78,11 +78,21 @@ class Hatching:
 
 @dataclass(frozen=True)
 class Crossing:
-    """A pedestrian crossing: a polygon and the direction in which pedestrians walk, radians."""
+    """A pedestrian crossing.
+
+    Attributes:
+        polygon: its outline, metres.
+        style: its paint.
+        heading: the direction in which pedestrians walk, radians.
+        surface: what the ground below the paint is made of; the road's own where empty.
+        wear: share of the paint that is gone; None where it is as with any other paint.
+    """
 
     polygon: Polygon
     style: CrossingStyle
     heading: float
+    surface: str = ""
+    wear: float | None = None
 
 
 @dataclass(frozen=True)

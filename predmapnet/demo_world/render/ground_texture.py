@@ -249,6 +249,10 @@ def _pyramid(
         _draw_damage(material, sheet, road, near, world.seed)
         for name, quads in world.clutter.patches:
             _fill_quads(material, sheet, quads, _INDEX[name])
+    for crossing in world.map.crossings:
+        if crossing.surface:
+            for part in shapely.get_parts(crossing.polygon.intersection(road)):
+                _fill(material, sheet, part, _INDEX[crossing.surface])
     _draw_kerbs(material, sheet, road, world.clutter.kerbs, generator)
     occlusion, shadow = _shade(sheet, dark)
 

@@ -192,6 +192,7 @@ def _side_lines(crossing: Crossing, width: float) -> Float:
 
 def _paint_crossing(quads: Quads, crossing: Crossing, generator: np.random.Generator) -> None:
     wear, albedo, width = _wear(generator), generator.uniform(0.5, 0.8), generator.uniform(0.2, 0.35)
+    wear = wear if crossing.wear is None else crossing.wear
     if crossing.style is not CrossingStyle.LINES:
         quads.add(_bars(crossing, generator), wear, albedo, 0.0)
     if crossing.style is not CrossingStyle.ZEBRA:

@@ -23,6 +23,9 @@ BARE_SHARE = 0.2
 NEAR = 48.0
 """Metres from the drive within which the ground is cluttered."""
 
+SHORTEST = 6.0
+"""Shorter lanes have no clutter of their own, metres."""
+
 SYMBOLS: dict[str, tuple[Callable[[Generator], Float], float, float, bool]] = {
     "arrows": (symbols.arrow, 0.6, 2.5, False),
     "cycles": (symbols.cycle, 0.3, 1.5, False),
@@ -30,6 +33,7 @@ SYMBOLS: dict[str, tuple[Callable[[Generator], Float], float, float, bool]] = {
     "teeth": (symbols.teeth, 0.3, 0.5, True),
     "bars": (symbols.bars, 0.3, 0.5, True),
     "humps": (symbols.hump, 0.25, 0.7, False),
+    "hatchings": (symbols.hatched, 0.4, 1.0, False),
     "boxes": (symbols.keep_clear, 0.3, 0.6, False),
     "zigzags": (symbols.zigzag, 0.2, 0.7, False),
 }
@@ -89,11 +93,10 @@ def draw_clutter(vector_map: VectorMap, road: shapely.Geometry, trajectory: Traj
 
 def _near(path: Float, near: shapely.Geometry) -> list[Lane]:
     """The parts of a lane's centre line near the drive, in the direction of travel."""
-    line = shapely.LineString(path)
     inside = np.flatnonzero(shapely.contains_xy(near, path))
-    if len(inside) < 3 or line.length < 6.0:
-        return []
     distance = arc_length(path)
+    if len(inside) < 2 or distance[inside[-1]] - distance[inside[0]] < SHORTEST:
+        return []
     return [Lane(cut(path, distance[inside[0]], distance[inside[-1]]))]
 
 

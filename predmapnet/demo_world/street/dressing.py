@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 from shapely import Polygon
 
 from mapfusion.arrays import Float
 from predmapnet.demo_world.street.clutter import draw_clutter
+from predmapnet.demo_world.street.manner import Manner
 from predmapnet.demo_world.street.solid_list import SolidList
 from predmapnet.demo_world.street.traffic import Parking, add_moving_traffic, ego_corridor, footprint
 from predmapnet.demo_world.world import Clutter, Look, Surface, Trajectory, VectorMap, World
@@ -45,9 +48,9 @@ def _stations(geometry: shapely.Geometry, spacing: float, generator: np.random.G
 
 
 def _surfaces(
-    vector_map: VectorMap, road: shapely.Geometry, sight: shapely.Geometry, generator: np.random.Generator
+    vector_map: VectorMap, road: shapely.Geometry, sight: shapely.Geometry, alike: bool, generator: np.random.Generator
 ) -> tuple[list[Surface], shapely.Geometry]:
-    """Ground materials from bottom to top, and the sidewalks among them."""
+    """Ground materials from bottom to top, and the sidewalks among them, which may be made as the road is."""
     surfaces: list[Surface] = []
     everything = sight.buffer(220).envelope
     base = ["grass", "grass", "soil", "concrete"][int(generator.integers(4))]
@@ -68,8 +71,8 @@ def _surfaces(
         verges = [shapely.Point(spot).buffer(generator.uniform(8, 26)) for spot in spots if generator.uniform() < 0.4]
         walkways = ring.difference(shapely.union_all(verges)) if verges else ring
     material = ["sidewalk", "sidewalk", "paving", "brick"][int(generator.integers(4))]
-    surfaces += [Surface(part, material) for part in _polygons(walkways)]
     tone = ["asphalt", "asphalt", "asphalt_old", "asphalt_new"][int(generator.integers(4))]
+    surfaces += [Surface(part, tone if alike else material) for part in _polygons(walkways)]
     # Islands and medians have a filling of their own.
     filling = ["grass", "paving", "concrete"][int(generator.integers(3))]
     for polygon in _polygons(road):
@@ -167,7 +170,7 @@ def dress(
         look: light and weather.
         seed: of all that is drawn by chance.
         name: of the scene.
-        cluttered: put on the ground what looks like elements of the map and is none.
+        cluttered: put on the ground what looks like elements of the map and is none, and pave and park as one likes.
     """
     generator = np.random.default_rng([seed, 31])
     positions = trajectory.ego_to_global[:, :2, 3]
@@ -176,7 +179,8 @@ def dress(
     shapely.prepare(sight)
     united = shapely.union_all([segment.buffer(0.02, join_style="mitre") for segment in vector_map.road_segments])
     road = united.buffer(-0.02, join_style="mitre").intersection(sight.buffer(200))
-    surfaces, _ = _surfaces(vector_map, road, sight, generator)
+    manner = Manner.draw(seed) if cluttered else Manner()
+    surfaces, _ = _surfaces(vector_map, road, sight, manner.paved_alike, generator)
 
     solids = SolidList()
     buildings = _put_up_buildings(solids, road, sight, generator)
@@ -186,8 +190,9 @@ def dress(
     forbidden = shapely.union_all([*crossings, *stops, ego_corridor(trajectory, width=4.3)])
     parking = Parking(solids, forbidden, generator)
     busy = generator.uniform(0.35, 0.9)
-    parking.in_bays(vector_map.parking, busy)
+    parking.in_bays(vector_map.parking, manner.parked or busy, manner.gaps)
     parking.along_kerbs(road, sight, 0.34 * busy)
     add_moving_traffic(solids, vector_map, road, trajectory, seed)
     clutter = draw_clutter(vector_map, road, trajectory, seed) if cluttered else Clutter()
+    clutter = replace(clutter, kerbs=manner.kerbs)
     return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids(), clutter)

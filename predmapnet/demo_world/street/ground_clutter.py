@@ -19,7 +19,7 @@ HALF_LANE = 1.65
 
 @dataclass(frozen=True)
 class Lane:
-    """The centre line ``(n, 2)`` of a lane, metres, in the direction of travel."""
+    """The centre line ``(n, 2)`` of a lane, at least 2 m long, metres, in the direction of travel."""
 
     path: Float
 
@@ -30,9 +30,10 @@ class Lane:
 
     def place(self, shape: Float, station: float) -> Float:
         """Put a shape of the lane's frame (x along, y left) at a station, by the direction that the lane has there."""
-        ends = cut(self.path, station, station + 2.0)
+        start = min(station, self.length - 2.0)
+        ends = cut(self.path, start, start + 2.0)
         step = (ends[-1] - ends[0]) / max(float(np.linalg.norm(ends[-1] - ends[0])), 1e-6)
-        placed: Float = shape @ np.array([step, [-step[1], step[0]]]) + ends[0]
+        placed: Float = shape @ np.array([step, [-step[1], step[0]]]) + ends[0] + (station - start) * step
         return placed
 
     def part(self, random: Generator, least: float, most: float) -> Float:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.random import Generator
+from shapely import Polygon
 
 from mapfusion.arrays import Float
-from predmapnet.demo_world.render.paint import ribbon
+from predmapnet.demo_world.render.paint import ribbon, stripes_over
 
 TIP = 0.04
 """Width of what is a point in paint, metres."""
@@ -105,6 +106,18 @@ def keep_clear(random: Generator) -> Float:
         parts.append(ribbon(np.array([[across, -width / 2], [across + width, width / 2]]), 0.12))
         parts.append(ribbon(np.array([[across + width, -width / 2], [across, width / 2]]), 0.12))
     return np.concatenate(parts)
+
+
+def hatched(random: Generator) -> Float:
+    """An area of stripes, aslant or along the lane as those of a zebra crossing, often with a line around it."""
+    length, width = float(random.uniform(1.5, 9.0)), float(random.uniform(0.8, 2.9))
+    corners = np.array([[0.0, 0.0], [length, 0.0], [length, width], [0.0, width]])
+    heading = np.radians(float(random.choice([0.0, 35.0, 45.0, 135.0, 90.0])))
+    stripe = float(random.uniform(0.2, 0.5))
+    stripes = stripes_over(Polygon(corners), heading, stripe, float(random.uniform(1.8, 3.0)) * stripe)
+    rim = ribbon(np.vstack([corners, corners[:1]]), 0.12) if random.random() < 0.6 else np.zeros((0, 4, 2))
+    shape: Float = np.concatenate([stripes, rim]) - np.array([0.0, float(random.uniform(0.0, width))])
+    return shape
 
 
 def zigzag(random: Generator) -> Float:

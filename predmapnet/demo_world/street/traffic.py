@@ -70,10 +70,12 @@ class Parking:
         self._solids.stand("box", centre, size, yaw, lacquer(self._generator), "vehicle")
         return True
 
-    def in_bays(self, bays: tuple[Polygon, ...], share: float) -> None:
-        """Fill strips of parking bays, places along or across the strip by its depth."""
+    def in_bays(self, bays: tuple[Polygon, ...], share: float, gaps: float = 0.0) -> None:
+        """Fill strips of parking bays, places along or across the strip by its depth; the share ``gaps`` stay empty."""
         generator = self._generator
         for bay in bays:
+            if gaps and generator.uniform() < gaps:
+                continue
             corners = np.asarray(bay.minimum_rotated_rectangle.exterior.coords)[:4]
             if np.linalg.norm(corners[1] - corners[0]) < np.linalg.norm(corners[2] - corners[1]):
                 corners = np.roll(corners, -1, axis=0)

@@ -16,6 +16,9 @@ from predmapnet.demo_world.world import LineStyle
 ACTIVE = 0.6
 """A strip narrower than this is not there, metres."""
 
+BROAD = (13.0, 22.0)
+"""Widths of broad streets from kerb to kerb, metres."""
+
 
 class Use(StrEnum):
     """Use of a strip."""
@@ -114,6 +117,8 @@ def draw_section(random: Generator, rank: Rank, habits: Habits) -> CrossSection:
     """Draw the cross-section of a street."""
     if rank is Rank.ALLEY:
         return _draw_alley(random)
+    if random.random() < habits.broad_share:
+        return _draw_broad(random, habits)
     one_way = bool(random.random() < {Rank.ARTERIAL: 0.08, Rank.COLLECTOR: 0.12, Rank.LOCAL: 0.25}[rank])
     shares = {
         Rank.ARTERIAL: [0.25, 0.55, 0.2],
@@ -145,6 +150,34 @@ def draw_section(random: Generator, rank: Rank, habits: Habits) -> CrossSection:
         lane_style=lane_style,
         solid_before_stop=float(random.choice([0.0, random.uniform(8.0, 40.0)], p=[0.35, 0.65])),
         edge_line=bool(not quiet and random.random() < habits.edge_line_share),
+    )
+
+
+def _draw_broad(random: Generator, habits: Habits) -> CrossSection:
+    """A carriageway of 13 to 22 m with cars parked along both kerbs, beside traffic or behind a line."""
+    width, parked = float(random.uniform(*BROAD)), float(random.uniform(1.9, 2.6))
+    room = width / 2 - parked
+    count = 1 if room < 5.4 else 2
+    marked = random.random() < 0.5
+    sides = []
+    for direction in (-1, 1):
+        side = [Strip(Use.LANE, direction, room / count) for _ in range(count)]
+        if marked:
+            side.append(Strip(Use.PARKING, direction, parked))
+        else:
+            side[-1].width += parked
+            side[-1].parked = parked
+        sides.append(side)
+    styles = [LineStyle.UNPAINTED, LineStyle.DASHED, LineStyle.SOLID, LineStyle.DOUBLE_SOLID]
+    return CrossSection(
+        left=sides[0],
+        middle=[Strip(Use.GAP, 0, 0.0)],
+        right=sides[1],
+        one_way=False,
+        centre_style=styles[random.choice(4, p=[0.12, 0.33, 0.22, 0.33])],
+        lane_style=LineStyle.DASHED,
+        solid_before_stop=float(random.choice([0.0, random.uniform(8.0, 40.0)])),
+        edge_line=bool(random.random() < habits.edge_line_share),
     )
 
 

@@ -142,7 +142,9 @@ def _between_kerbs(
     if not outline.is_valid or outline.area < 8.0:
         return None
     style = habits.crossing_styles[random.integers(len(habits.crossing_styles))]
-    return Crossing(shapely.geometry.polygon.orient(outline), style, float(np.angle(np.exp(1j * walk))))
+    surface = habits.crossing_surface if random.random() < habits.surfaced_share else ""
+    wear = float(random.uniform(0.4, 0.75)) if random.random() < habits.worn_share else None
+    return Crossing(shapely.geometry.polygon.orient(outline), style, float(np.angle(np.exp(1j * walk))), surface, wear)
 
 
 def cross_street(

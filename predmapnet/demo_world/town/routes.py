@@ -34,6 +34,9 @@ LONG_ENOUGH = 260.0
 MARGIN = 50.0
 """No key frame lies closer than this to where a street leaves the town, metres."""
 
+SEEN = 36.0
+"""Farther than the region of interest reaches, metres."""
+
 SHARPEST_BEND = 0.2
 """Curvature that a drive may have, per metre."""
 
@@ -48,7 +51,7 @@ class NoDriveError(Exception):
 def drive(town: Town, seed: int) -> Trajectory:
     """Drive through a town for 20 s: 40 key frames, 0.5 s apart, with a small pitch and roll.
 
-    Raises NoDriveError where no street is long enough, or traffic stops the car too early.
+    Raises NoDriveError where no street is long enough, traffic stops the car too early, or a street's loose end is seen.
     """
     random = np.random.default_rng([0x726F757465, seed])
     path, stops = _draw_path(random, town)
@@ -57,6 +60,10 @@ def drive(town: Town, seed: int) -> Trajectory:
     driven = drive_along_path(random, path, stops, float(random.uniform(7.0, 12.0)), seed)
     if arc_length(driven.ego_to_global[:, :2, 3])[-1] <= SHORTEST_DRIVE:
         raise NoDriveError("the drive is too short")
+    ends = np.array([way.lines[0][end] for way in town.carriageways for end in (0, -1) if way.nodes[end] < 0])
+    ends = mirrored(ends) if town.vector_map.left_hand else ends
+    if len(ends) and shapely.MultiPoint(ends).distance(shapely.MultiPoint(driven.ego_to_global[:, :2, 3])) < SEEN:
+        raise NoDriveError("the drive sees the end of a street that ends nowhere")
     return driven
 
 

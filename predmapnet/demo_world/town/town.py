@@ -101,12 +101,12 @@ def _cross_junction(
             works.crossings.append(crossing)
             corners = shapely.points(shapely.get_coordinates(crossing.polygon)[:-1])
             along = arm.side * (shapely.line_locate_point(line.shape, corners) - arm.station)
-            reach.stop = float(along.max()) + float(random.uniform(0.4, 2.0))
+            reach.stop = float(along.max()) + float(random.uniform(0.3, 2.0 if random.random() < 0.65 else 5.5))
         reach.stop = max(min(reach.stop, 0.47 * room), 1.0)
         kind = random.random()
         gap = random.uniform(0.1, 1.2) if kind < 0.5 else random.uniform(1.2, 7.0 if kind < 0.8 else 18.0)
         reach.paint = reach.stop + min(float(gap), 0.2 * room)
-        if not is_alley and random.random() < (habits.stop_line_share if crossing is not None else 0.25):
+        if not is_alley and random.random() < (habits.stop_line_share if crossing else habits.bare_stop_share):
             _stop_line(line, sections[arm.street], reach, works)
 
 
