@@ -51,7 +51,7 @@ class NoDriveError(Exception):
 def drive(town: Town, seed: int) -> Trajectory:
     """Drive through a town for 20 s: 40 key frames, 0.5 s apart, with a small pitch and roll.
 
-    Raises NoDriveError where no street is long enough, traffic stops the car too early, or a street's loose end is seen.
+    Raises NoDriveError where no street is long enough, traffic stops the car too early, or a loose end is in sight.
     """
     random = np.random.default_rng([0x726F757465, seed])
     path, stops = _draw_path(random, town)
