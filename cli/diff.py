@@ -40,7 +40,8 @@ def diff(
     """
     from cli.console import err, print_json, say_warning
     from cli.console import out as screen
-    from mapfusion.diff import DiffConfig, diff_maps, write_diff
+    from mapfusion.diff import DiffConfig, diff_maps
+    from mapfusion.diff_files import write_diff
     from mapfusion.formats.by_suffix import read_maps
     from mapfusion.provenance import united_provenance
     from predmapnet import __version__

@@ -38,7 +38,8 @@ def merge(
     """
     from cli.console import counted, elements_table, print_json, progress_display, say_warning
     from cli.console import out as screen
-    from mapfusion.formats.by_suffix import check_crs, check_suffix, maps_in
+    from cli.maps_of_folders import maps_below
+    from mapfusion.formats.by_suffix import check_crs, check_suffix
     from mapfusion.formats.qgis_style import write_styles
     from mapfusion.merge.config import MergeConfig
     from mapfusion.merge.merge import merge_files
@@ -49,7 +50,7 @@ def merge(
     with value_errors_told():
         check_suffix(out)
         check_crs(out, crs)
-        paths = [file for path in maps for file in (maps_in(path) if path.is_dir() else [path])]
+    paths = [file for path in maps for file in (maps_below(path) if path.is_dir() else [path])]
     # A city map among the drives' is the result of the last time.
     paths = [path for path in paths if path in maps or path.absolute() != out.absolute()]
     if not paths:

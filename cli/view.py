@@ -27,7 +27,7 @@ def view(
         typer.Argument(
             metavar="WHAT",
             help="A scene or the folder of a log (mapped now), a recording (.rrd), a map of any format or a folder of "
-            "maps; or two maps, older first: what changed.",
+            "maps; two maps, older first, or a file of diff: what changed; per-frame results (.parquet), then a scene.",
         ),
     ],
     web: Annotated[bool, typer.Option("--web", help="Serve a viewer for the web browser instead.")] = False,
@@ -59,6 +59,7 @@ def view(
     """
     from cli.console import err, progress_display, say_report, say_warning, warn_of_weights
     from cli.viewer import WebOptions, open_viewer, show_file
+    from mapfusion.diff_files import holds_differences
     from predmapnet.errors import value_errors_told
     from predmapnet.files import check_output
     from predmapnet.runs.outputs import Outputs
@@ -71,14 +72,22 @@ def view(
     if what[0].lower().endswith(".rrd") and len(what) == 1:
         show_file(Path(what[0]), browser)
         return
-    folder = folder_named(what[0], dataset) if len(what) == 1 else None
-    if folder is None and (maps := map_files(what)):
-        from predmapnet.recording import log_changes, log_maps
+    if what[0].lower().endswith(".parquet") and len(what) <= 2:
+        from predmapnet.recording import log_frames
 
         with open_viewer(name, browser, out) as recording:
-            log = log_changes if len(what) == 2 == len(maps) else log_maps
-            with value_errors_told():
-                notes = log(recording, maps)
+            for note in log_frames(recording, Path(what[0]), what[1] if len(what) == 2 else None, track):
+                say_warning(note)
+        return
+    folder = folder_named(what[0], dataset) if len(what) == 1 else None
+    if folder is None and (maps := map_files(what)):
+        from predmapnet.recording import log_changes, log_differences, log_maps
+
+        with open_viewer(name, browser, out) as recording, value_errors_told():
+            if len(what) == 1 and holds_differences(maps[0]):
+                notes = log_differences(recording, maps[0])
+            else:
+                notes = (log_changes if len(what) == 2 == len(maps) else log_maps)(recording, maps)
             for note in notes:
                 say_warning(note)
         return
@@ -109,14 +118,14 @@ def map_files(named: list[str]) -> list[Path]:
     Raises:
         UserError: there is no map in a folder, or of several names one is no map.
     """
-    from mapfusion.formats.by_suffix import map_suffix, maps_in
-    from predmapnet.errors import UserError, value_errors_told
+    from cli.maps_of_folders import maps_below
+    from mapfusion.formats.by_suffix import map_suffix
+    from predmapnet.errors import UserError
 
     found: list[Path] = []
     for path in map(Path, named):
         if path.is_dir():
-            with value_errors_told():
-                found.extend(maps_in(path))
+            found.extend(maps_below(path))
         elif map_suffix(path) is not None:
             found.append(path)
         elif len(named) > 1:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
@@ -15,10 +12,8 @@ import shapely
 from mapfusion.alignment import Alignment, align, landmarks
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
-from mapfusion.formats.geojson import geometry_of, origin_of
-from mapfusion.formats.seal import write_sealed
 from mapfusion.geometry import arc_length
-from mapfusion.georeference import Georeference, InvertibleGeoreference
+from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import coverage, inside
 from mapfusion.stretches import Pairing, Samples, equal_runs, pair, sample_lines, settle
 
@@ -148,32 +143,6 @@ def diff_maps(
         differences.extend(compare(kind, old.of_kind(kind), new.of_kind(kind), ground, config))
     differences.sort(key=lambda d: (ORDER.index(d.change), int(d.kind)))
     return MapDiff(tuple(differences), alignment)
-
-
-def write_diff(
-    difference: MapDiff, path: Path, georeference: Georeference, provenance: dict[str, Any] | None = None
-) -> None:
-    """Write a diff as GeoJSON: LineStrings (crossings Polygons) with ``change``, ``kind``, ``length_m``, ``moved_m``.
-
-    Raises ValueError for coordinates that are not on the globe, OSError if the file cannot be written.
-    """
-    features = [_feature(item, georeference) for item in difference.differences]
-    origin = origin_of(provenance or {}, georeference)
-    document = {"type": "FeatureCollection", "predmapnet": origin, "features": features}
-    with write_sealed(path) as temporary:
-        temporary.write_text(json.dumps(document, separators=(",", ":"), allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _feature(item: Difference, georeference: Georeference) -> dict[str, Any]:
-    properties = {
-        "change": item.change.value,
-        "kind": item.kind.label,
-        "length_m": round(item.length, 3),
-        "moved_m": None if np.isnan(item.moved_by) else round(item.moved_by, 3),
-        "confidence": round(item.confidence, 4),
-    }
-    geometry, _ = geometry_of(item.kind, item.points, georeference)
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
 def _compare_lines(

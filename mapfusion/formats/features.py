@@ -28,6 +28,9 @@ from mapfusion.road_heights import filled
 HEIGHTS = "heights_m"
 """Column with the heights of the vertices, in formats whose geometries have none."""
 
+DIFFERENCE = ("change", "moved_m")
+"""Properties of the features of a file of differences (:mod:`mapfusion.diff_files`), which no element has."""
+
 SURE = 1.0
 """Confidence of an element that a person drew."""
 
@@ -88,6 +91,8 @@ def map_of(
     found: list[_Element] = []
     place = -1
     for place, feature in enumerate(features):
+        if _is_difference(feature):
+            raise ValueError(f"{path}: it holds the differences of two maps, and is no map; 'predmapnet view' shows it")
         try:
             found.extend(_elements(place, feature, notes))
         except (ValueError, TypeError, KeyError) as error:
@@ -103,6 +108,11 @@ def map_of(
         georeference = LocalPlane(*((positions.min(axis=0) + positions.max(axis=0)) / 2).tolist())
     elements = tuple(_completed(found, georeference, notes))
     return GlobalMap(elements, provenance, notes.sentences())
+
+
+def _is_difference(feature: Feature) -> bool:
+    properties = feature.content.get("properties") if isinstance(feature.content, Mapping) else None
+    return isinstance(properties, Mapping) and all(name in properties for name in DIFFERENCE)
 
 
 def _elements(place: int, feature: Feature, notes: ReadingNotes) -> list[_Element]:

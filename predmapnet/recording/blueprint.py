@@ -102,18 +102,19 @@ def scene_blueprint(rig: Rig, bev_shape: tuple[int, int], content: Content, live
     """Lay out a scene.
 
     Args:
-        rig: the cameras.
+        rig: the cameras; without any, the map takes their place.
         bev_shape: rows and columns of the BEV panels, pixels.
         content: what there is to show.
         live: play at once, follow the newest frame, and show the map as it grows.
     """
     cameras = rrb.Grid(*[_camera_view(name) for name in _in_order(rig)], grid_columns=3 if len(rig) == 6 else None)
+    above = rrb.Horizontal(cameras, _map_tabs(content, live), column_shares=[1.5, 1.0])
     columns = [_car_view(), _bev_column(content, bev_shape, 0), _bev_column(content, bev_shape, 1), _plots(content)]
     shares = [1.35, 1.0, 1.0, 0.85]
     shown = [(column, share) for column, share in zip(columns, shares, strict=True) if column is not None]
     return _blueprint(
         rrb.Vertical(
-            rrb.Horizontal(cameras, _map_tabs(content, live), column_shares=[1.5, 1.0]),
+            above if rig else _map_tabs(content, live),
             rrb.Horizontal(*(column for column, _ in shown), column_shares=[share for _, share in shown]),
         ),
         rrb.TimePanel(state="collapsed", timeline="frame", fps=4.0, play_state="following" if live else None),

@@ -11,6 +11,7 @@ import rerun as rr
 from mapfusion.arrays import Float
 from mapfusion.colours import CHANGE_COLOURS
 from mapfusion.diff import Change, MapDiff, diff_maps
+from mapfusion.diff_files import read_diff
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.formats.by_suffix import frame_of, read_maps
 from mapfusion.formats.identities import all_named
@@ -68,6 +69,29 @@ def log_changes(recording: rr.RecordingStream, paths: Sequence[Path]) -> list[st
     """
     maps, plane, origin = _begin(recording, paths)
     found = diff_maps(maps[0], maps[1], plane)
+    _draw_changes(recording, found, origin)
+    _describe(recording, f"{paths[0].name} → {paths[1].name}", maps, _changes(found))
+    return _notes(paths, maps)
+
+
+def log_differences(recording: rr.RecordingStream, path: Path) -> list[str]:
+    """Draw a file that ``predmapnet diff`` wrote. Returns and raises as :func:`log_maps`."""
+    try:
+        found, _, told = read_diff(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot show {path}: {error}") from error
+    if not found.differences:
+        raise UserError(f"{path}: it holds no differences, so there is nothing to look at")
+    points = np.concatenate([item.points for item in found.differences])
+    recording.send_blueprint(map_blueprint(Extent.of(points, 5.0), on_earth=False))
+    recording.log("world", WORLD_COORDINATES, static=True)
+    _draw_changes(recording, found, np.zeros(2))
+    title = " → ".join(str(told[name]) for name in ("old", "new") if name in told) or path.name
+    _describe(recording, title, [GlobalMap((), told)], _changes(found))
+    return []
+
+
+def _draw_changes(recording: rr.RecordingStream, found: MapDiff, origin: Float) -> None:
     for change in Change:
         for kind in ElementKind:
             stretches = [item for item in found.differences if item.change is change and item.kind is kind]
@@ -83,8 +107,6 @@ def log_changes(recording: rr.RecordingStream, paths: Sequence[Path]) -> list[st
                 show_labels=False,
             )
             recording.log(f"world/{change}/{kind.label}", lines, static=True)
-    _describe(recording, f"{paths[0].name} → {paths[1].name}", maps, _changes(found))
-    return _notes(paths, maps)
 
 
 def _begin(recording: rr.RecordingStream, paths: Sequence[Path]) -> tuple[list[GlobalMap], LocalPlane, Float]:

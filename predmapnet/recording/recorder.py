@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 import rerun as rr
@@ -26,7 +27,7 @@ from predmapnet.recording.map_lines import WORLD_COORDINATES, lifted, log_on_ear
 from predmapnet.recording.pictures import Pictures
 from predmapnet.recording.projection import dashes, project_line
 from predmapnet.recording.tracks import TrackAges, Tracks, forecast_errors_by_kind
-from predmapnet.scenes import Frame, Scene
+from predmapnet.scenes import Frame, Instant, Rig
 
 APPLICATION = "predmapnet"
 MAP_EVERY_FRAMES = 4
@@ -36,6 +37,22 @@ STAGES = {
     "integration": ("integration", (160, 230, 160)),
 }
 """Stages of a frame: name and colour of each."""
+
+
+class Drive(Protocol):
+    """Drive as far as a recording needs it: a :class:`predmapnet.scenes.Scene`, or results without images."""
+
+    @property
+    def rig(self) -> Rig:
+        """The car's cameras; none for results without images."""
+
+    def __len__(self) -> int: ...
+
+    def instant(self, index: int) -> Instant:
+        """Return time stamp and pose of frame ``index``."""
+
+    def truth_map(self) -> GlobalMap | None:
+        """Return the ground truth in the global frame, or None."""
 
 
 class SceneRecorder:
@@ -66,7 +83,7 @@ class SceneRecorder:
         self._logged: dict[str, bytes] = {}
         self._before: FrameMap | None = None
 
-    def begin(self, scene: Scene, roi: RegionOfInterest) -> None:
+    def begin(self, scene: Drive, roi: RegionOfInterest) -> None:
         """Log what does not change: layout, cameras, the car, its way, the ground truth."""
         rec = self._recording
         way = np.array([scene.instant(index).ego_to_global[:2, 3] for index in range(len(scene))])
@@ -192,7 +209,7 @@ class SceneRecorder:
             self._recording.log(f"plots/elements/{kind.label}", rr.Scalars(int((now.kinds == kind).sum())))
         for kind, metres in ({} if before is None else forecast_errors_by_kind(before, now)).items():
             self._recording.log(f"plots/forecast_error/{kind.label}", rr.Scalars(metres))
-        for stage in STAGES:
+        for stage in STAGES.keys() & milliseconds.keys():
             self._recording.log(f"plots/milliseconds/{stage}", rr.Scalars(milliseconds[stage]))
 
     def _log_growth(self, global_map: GlobalMap) -> None:

@@ -38,15 +38,15 @@ def without_time(path: Path) -> bytes:
 
 
 def write_data(root: Path, count: int) -> Path:
-    """Write the scenes and their manifest; a table of the hanging one has no end."""
+    """Write the scenes and their manifest; an image of the hanging one has no end."""
     names = tuple(f"scene-{number:04d}" for number in range(count - 1))
     data = write_tiny_nuscenes(root / "data", names, frames=3)
     for name in BROKEN:
         path = image_path(data, name, 1, "CAM_FRONT")
         path.write_bytes(path.read_bytes()[:900])
     hanging = write_tiny_nuscenes(root / "hanging", (HANGING,), frames=1)
-    (hanging / "v1.0-mini" / "ego_pose.json").unlink()
-    (hanging / "v1.0-mini" / "ego_pose.json").symlink_to(ENDLESS)
+    image_path(hanging, HANGING, 0, "CAM_FRONT").unlink()
+    image_path(hanging, HANGING, 0, "CAM_FRONT").symlink_to(ENDLESS)
     lines = [*(f"{name},data" for name in names), f"{HANGING},hanging"]
     (root / "list.csv").write_text("\n".join(["scene,folder", lines[-1], *lines[:-1]]) + "\n")
     return root / "list.csv"
@@ -115,7 +115,7 @@ def main() -> None:
         nodes = [tried(lambda: cluster.add_node(num_cpus=2)) for _ in range(2)]
         out = root / "maps"
         arguments = ["batch", str(manifest), "--out", str(out), "--weights", str(weights), "--engine", "ray"]
-        arguments += ["--address", cluster.address, "--jobs", "2", "--scene-timeout", "60"]
+        arguments += ["--address", cluster.address, "--jobs", "2", "--scene-timeout", "30"]
         command = [sys.executable, "-m", "cli.main", *arguments]
 
         def done() -> dict[str, int]:

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapfusion import ElementKind, GlobalMap, MapElement
-from mapfusion.diff import Change, DiffConfig, diff_maps, write_diff
+from mapfusion.diff import Change, DiffConfig, diff_maps
+from mapfusion.diff_files import read_diff, write_diff
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import resample
 from mapfusion.ground import RIM, observed_rings
@@ -166,6 +167,24 @@ def test_the_file_is_geojson_with_every_stretch(tmp_path):
     assert len(features) == len(found.differences)
     assert {f["properties"]["change"] for f in features} >= {"unchanged", "removed"}
     assert resample(np.array(features[-1]["geometry"]["coordinates"]).reshape(-1, 2), 2).shape == (2, 2)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 5), st.floats(0.0, 2.0), st.integers(0, 4))
+def test_a_file_gives_its_differences_back(tmp_path_factory, seed, shift, lost):
+    plane, path = LocalPlane(8.0, 49.0), tmp_path_factory.mktemp("diff") / "diff.geojson"
+    later = GlobalMap(tuple(replace(e, points=e.points + [shift, shift]) for e in town(seed).elements[lost:]))
+    found = diff_maps(town(seed), later, plane, DiffConfig(align=False))
+    write_diff(found, path, plane, {"old": "a"})
+    again, own_plane, told = read_diff(path)
+    assert told["old"] == "a"
+    for stored, item in zip(again.differences, found.differences, strict=True):
+        assert (stored.change, stored.kind) == (item.change, item.kind)
+        assert stored.length == pytest.approx(item.length, abs=1e-3)
+        assert stored.moved_by == pytest.approx(item.moved_by, abs=1e-3, nan_ok=True)
+        assert stored.confidence == pytest.approx(item.confidence, abs=1e-4)
+        ways = plane.from_wgs84(own_plane.to_wgs84(stored.points))
+        assert shapely.hausdorff_distance(shapely.LineString(ways), shapely.LineString(item.points)) < 1e-3
 
 
 def test_empty_maps_compare():
