@@ -21,6 +21,17 @@ def entities(path) -> dict[str, int]:
     return rows
 
 
+def values(path, entity, component) -> list:
+    """Values of a component by frame, in the order of time."""
+    rows = []
+    for chunk in RrdReader(path).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == entity and component in batch.schema.names:
+            times = batch.column("frame").to_pylist() if "frame" in batch.schema.names else [0] * batch.num_rows
+            rows += zip(times, batch.column(component).to_pylist(), strict=True)
+    return [value for _, value in sorted(rows, key=lambda row: row[0])]
+
+
 def street(path, shift=0.0):
     lines = [np.array([[0.0, 0.0], [90.0, 0.0], [90.0, 60.0]]), np.array([[0.0, 4.0 + shift], [80.0, 4.0 + shift]])]
     kinds = [ElementKind.BOUNDARY, ElementKind.DIVIDER]
@@ -52,7 +63,11 @@ def test_per_frame_results_are_seen_frame_by_frame_with_the_map_they_make(predma
     assert "1 of 4 frames have broken poses" in result.err
     found = entities(tmp_path / "one.rrd")
     assert found["/world/ego_vehicle/tracks/divider"] == found["/world/ego_vehicle"] == 3
-    assert found["/world/whole_map/divider"] == 1
+    ways = values(tmp_path / "one.rrd", "/world/ego_vehicle", "Transform3D:translation")
+    assert [round(way[0][0]) for way in ways] == [0, 4, 8]
+    ((label,),) = values(tmp_path / "one.rrd", "/world/whole_map/divider", "LineStrips3D:labels")
+    assert label.startswith("divider")
+    assert "3 observations" in label
     assert predmapnet("view", frames, "two", "--out", "two.rrd").code == 0
     assert entities(tmp_path / "two.rrd")["/world/ego_vehicle/tracks/divider"] == 5
 
