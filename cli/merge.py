@@ -12,7 +12,11 @@ from cli.options import Crs, Force, Json
 from cli.workers import Address, EngineOption, Jobs, WorkerKind, open_executor
 
 if TYPE_CHECKING:
+    from mapfusion.merge.choice import Choice
     from mapfusion.merge.report import MergeReport
+
+MOST_NAMED = 20
+"""Number of maps left out that are named."""
 
 
 def merge(
@@ -24,6 +28,10 @@ def merge(
     tile: Annotated[
         float, typer.Option(min=50.0, help="Side of a tile, metres; larger tiles need more memory.")
     ] = 200.0,
+    at_most: Annotated[
+        int | None,
+        typer.Option(min=1, help="Take at most this many maps, those that add most.", show_default=False),
+    ] = None,
     jobs: Jobs = None,
     engine: EngineOption = WorkerKind.PROCESS,
     address: Address = None,
@@ -56,7 +64,7 @@ def merge(
     if not paths:
         raise UserError(f"the only map there is {out} itself")
     check_output(out, (), paths, force)
-    config, told = MergeConfig(tile=tile), {"version": __version__}
+    config, told = MergeConfig(tile=tile, at_most=at_most), {"version": __version__}
     with (
         value_errors_told(),
         progress_display() as display,
@@ -69,7 +77,7 @@ def merge(
         print_json({**asdict(report), "written": written})
     else:
         screen.print(elements_table("", report.elements, report.metres))
-        screen.print(_alignment_sentence(report), markup=False)
+        screen.print("\n".join([*_choice_lines(report), _alignment_sentence(report)]), markup=False)
         screen.print("\n".join(f"written: {path}" for path in written), markup=False)
     if not sum(report.elements.values()):
         say_warning(f"{out} is empty: none of the {counted(len(report.maps), 'map')} holds an element")
@@ -81,6 +89,26 @@ def merge(
         say_warning(f"{name}: {note}")
     for name in report.duplicates:
         say_warning(f"{name} is the same as another map and counts once")
+
+
+def _choice_lines(report: MergeReport) -> list[str]:
+    """Say which maps were taken, in which order, and what the others would have added."""
+    taken = [one for one in report.choice if one.taken]
+    left = report.choice[len(taken) :]
+    if not left:
+        return []
+    more = len(left) - MOST_NAMED
+    return [
+        f"{len(taken)} of {len(report.choice)} maps taken, what adds most first:",
+        *map(_choice_line, taken),
+        "left out, for they would add less than any of these:",
+        *map(_choice_line, left[:MOST_NAMED]),
+        *([f"  and {more} more (--json names all)"] if more > 0 else []),
+    ]
+
+
+def _choice_line(one: Choice) -> str:
+    return f"  {one.name}: {one.new_ground:,.0f} m² of new ground, {one.adds:,.0f} m² with its evidence"
 
 
 def _alignment_sentence(report: MergeReport) -> str:

@@ -26,6 +26,7 @@ class MergeConfig:
         ring_overlap: intersection over union from which two crossings are one.
         max_partners: a map is aligned with at most this many others, those that share most ground.
         max_gap: gaps in the evidence up to this length are bridged, metres.
+        at_most: number of maps to take, those that add most (:mod:`mapfusion.merge.choice`); None takes all.
     """
 
     match_distance: float = 1.5
@@ -44,3 +45,4 @@ class MergeConfig:
     ring_overlap: float = 0.25
     max_partners: int = 12
     max_gap: float = 5.0
+    at_most: int | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,8 +20,9 @@ from mapfusion.formats.by_suffix import MapWriter, check_frames, frame_of, read_
 from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.geometry import arc_length, simplified_rows
 from mapfusion.georeference import InvertibleGeoreference
-from mapfusion.ground import ground_within, rings_around
+from mapfusion.ground import coverage, ground_within, rings_around
 from mapfusion.line_repair import repaired_rows
+from mapfusion.merge.choice import Choice, LookedAt, choose, looked_at
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.corrections import Correction, solve_corrections
 from mapfusion.merge.map_cache import MapCache
@@ -113,7 +114,7 @@ def merge_maps(
     names = list(names) if names is not None else [f"map {i}" for i in range(len(maps))]
     merge = _Merge(MapCache(maps, plane), names, config or MergeConfig())
     elements = tuple(merge.elements(Sequential(), None))
-    return GlobalMap(elements, {"sources": sorted(names)}), merge.report()
+    return GlobalMap(elements, {"sources": merge.sources}), merge.report()
 
 
 def merge_files(
@@ -144,7 +145,7 @@ def merge_files(
     plane = common_plane(np.array(boxes)) if boxes else LocalPlane(0.0, 0.0)
     names = short_names(paths)
     merge = _Merge(MapCache(list(paths), plane), names, config or MergeConfig())
-    told = {**merge.provenance, "generator": "predmapnet merge", "sources": sorted(names), **(provenance or {})}
+    told = {**merge.provenance, "generator": "predmapnet merge", "sources": merge.sources, **(provenance or {})}
     observed = merge.observed()
     if observed is not None:
         told["observed"] = observed
@@ -160,24 +161,48 @@ class _Merge:
     def __init__(self, cache: MapCache, names: Sequence[str], config: MergeConfig) -> None:
         self.cache = cache
         self.config = config
-        looked = [(_summary(cache, i, name), cache.raw(i).provenance) for i, name in enumerate(names)]
-        entries = [entry for entry, _ in looked if entry is not None]
-        self.provenance = united_provenance(told for _, told in looked)
-        entries.sort(key=lambda entry: (-entry.evidence, entry.digest, entry.name))
+        summaries, looked = self._looked_through(names)
+        entries = sorted(summaries.values(), key=lambda entry: (-entry.evidence, entry.digest, entry.name))
         first: dict[str, _MapSummary] = {}
         for entry in entries:
             first.setdefault(entry.digest, entry)
-        self.entries = list(first.values())
+        check_frames((entry.name, entry.frame) for entry in entries)
+        self.choice = self._chosen(list(first.values()), looked)
+        left = {one.name for one in self.choice if not one.taken}
+        left |= {entry.name for entry in entries if first[entry.digest].name in left}
+        self.entries = [entry for entry in first.values() if entry.name not in left]
+        entries = [entry for entry in entries if entry.name not in left]
         self.duplicates = tuple(sorted(entry.name for entry in entries if first[entry.digest] is not entry))
+        self.sources = sorted(set(names) - left)
+        self.provenance = united_provenance(told for name, told in self._told.items() if name not in left)
         self.notes = tuple((entry.name, note) for entry in entries for note in entry.notes)
         self.notes += notes_of_copies((entry.name, entry.origin) for entry in self.entries)
-        check_frames((entry.name, entry.frame) for entry in entries)
-        self.empty = sorted(set(names) - {entry.name for entry in entries})
+        self.empty = sorted(set(names) - summaries.keys())
         self.names = list(names)
         self.statuses: list[MapStatus] = [MapStatus(name, Correction(), 0, "the map is empty") for name in self.empty]
         self.counts = {kind.label: 0 for kind in ElementKind}
         self.metres = {kind.label: 0.0 for kind in ElementKind}
         self.tile_count = 0
+
+    def _looked_through(self, names: Sequence[str]) -> tuple[dict[str, _MapSummary], dict[str, LookedAt]]:
+        """Look at every map once: what those are that hold something, and, for a choice, where they looked."""
+        self._told: dict[str, Mapping[str, Any]] = {}
+        summaries, looked = {}, {}
+        for place, name in enumerate(names):
+            raw = self.cache.raw(place)
+            self._told[name] = raw.provenance
+            summary = _summary(raw, place, name)
+            if summary is not None:
+                summaries[name] = summary
+                if self.config.at_most is not None:
+                    looked[name] = looked_at(raw, coverage(raw, self.cache.plane))
+        return summaries, looked
+
+    def _chosen(self, entries: Sequence[_MapSummary], looked: Mapping[str, LookedAt]) -> tuple[Choice, ...]:
+        if self.config.at_most is None or len(entries) <= self.config.at_most:
+            return ()
+        names = [entry.name for entry in entries]
+        return tuple(choose(names, [looked[name] for name in names], self.config.at_most))
 
     def observed(self) -> list[list[list[float]]] | None:
         """Return the ground that the maps together have observed, rings in degrees, if each of them says its own."""
@@ -201,7 +226,9 @@ class _Merge:
     def report(self) -> MergeReport:
         """Return the report, once all elements were taken."""
         statuses = tuple(sorted(self.statuses, key=lambda status: status.name))
-        return MergeReport(statuses, self.duplicates, self.counts, self.metres, self.tile_count, self.notes)
+        return MergeReport(
+            statuses, self.duplicates, self.counts, self.metres, self.tile_count, self.notes, self.choice
+        )
 
     def _counted(self, element: MapElement) -> MapElement:
         self.counts[element.kind.label] += 1
@@ -287,9 +314,8 @@ def _groups(tasks: list[_Task]) -> list[list[_Task]]:
     return [tasks[first : first + NEIGHBOURS] for first in range(0, len(tasks), NEIGHBOURS)]
 
 
-def _summary(cache: MapCache, place: int, name: str) -> _MapSummary | None:
+def _summary(raw: GlobalMap, place: int, name: str) -> _MapSummary | None:
     """Look at a map once, before anything is merged; None for an empty one."""
-    raw = cache.raw(place)
     if not len(raw):
         return None
     points = np.concatenate([element.points for element in raw])

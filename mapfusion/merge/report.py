@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapfusion.merge.choice import Choice
 from mapfusion.merge.corrections import Correction
 
 
@@ -40,11 +41,12 @@ class MergeReport:
     """Report of a merge.
 
     Attributes:
-        maps: one entry per map, by name.
+        maps: one entry per map that was taken, by name.
         duplicates: names of maps that are the same as another, and were counted once.
         elements, metres: of the result, by label of the kind.
         tiles: how many were fused.
         notes: of the reader: names of maps, and what was repaired, supplied or left out of each.
+        choice: which maps were taken, and what the others would have added; empty if all were.
     """
 
     maps: tuple[MapStatus, ...]
@@ -53,6 +55,7 @@ class MergeReport:
     metres: dict[str, float]
     tiles: int
     notes: tuple[tuple[str, str], ...] = ()
+    choice: tuple[Choice, ...] = ()
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:

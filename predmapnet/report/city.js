@@ -270,11 +270,12 @@
   });
   sheet.querySelector(".ramp").style.background = `linear-gradient(90deg, ${[0, 0.25, 0.5, 0.75, 1].map(ramp)})`;
   document.querySelectorAll(".doubts li").forEach((line, number) => line.addEventListener("click", () => showDoubt(number)));
-  document.querySelectorAll("tr[data-row]").forEach((line) => line.addEventListener("click", (event) => {
-    if (event.target.closest("a")) return;
+  document.addEventListener("click", (event) => { // the tables are still to come
+    const line = event.target.closest("tr[data-row]");
+    if (!line || event.target.closest("a")) return;
     sheet.scrollIntoView({ block: "nearest", behavior: "smooth" });
     showRow(+line.dataset.row);
-  }));
+  });
   let first = true;
   new ResizeObserver(() => {
     const ratio = window.devicePixelRatio || 1;
@@ -283,6 +284,6 @@
     if (first) Object.assign(view, all());
     first = false;
     paint();
-    document.body.dataset.drawn = map.n;
+    document.body.dataset.drawn ??= performance.now();
   }).observe(sheet);
 })();

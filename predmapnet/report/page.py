@@ -19,6 +19,9 @@ from predmapnet.report.places import Place
 
 DOUBT_COLOUR = CHANGE_COLOURS["removed"]
 
+ROWS_AT_ONCE = 60
+"""Rows of a table that the browser lays out before anything else is done; the others follow when it is idle."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -56,17 +59,13 @@ class SheetDoubt:
 def page(title: str, parts: Iterable[str]) -> str:
     """Return a page as HTML."""
     body = "".join(parts)
-    scripts = "".join(
-        f"<script>{_asset(name)}</script>"
-        for name, sign in (("tables.js", "<table"), ("city.js", 'id="city-data"'))
-        if sign in body
-    )
+    script = f"<script>{_asset('tables.js')}</script>" if "<table" in body else ""
     style = f":root {{ --ground: {web_colour(BACKGROUND)}; }}\n{_asset('page.css')}"
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{style}</style></head><body><main><h1>{escape(title)}</h1>"
-        f"{body}</main>{scripts}</body></html>\n"
+        f"{body}</main>{script}</body></html>\n"
     )
 
 
@@ -110,9 +109,10 @@ def sortable_table(
     find = (
         f'<input class="find" type="search" placeholder="Find" aria-label="Find" data-table="{name}">' if name else ""
     )
+    first, rest = "".join(lines[:ROWS_AT_ONCE]), "".join(lines[ROWS_AT_ONCE:])
     return (
         f'{find}<div class="wide"><table class="sortable" id="{name or "table"}"><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{''.join(lines)}</tbody></table></div>"
+        f"<tbody>{first}</tbody></table>{f'<template>{rest}</template>' if rest else ''}</div>"
     )
 
 
@@ -151,6 +151,8 @@ def city_sheet(
         f'<div class="bar">{_controls(places, any(item.truth for item in drawn), doubts is not None)}</div>'
         '<div class="scale"><span> </span><i></i></div><div class="where"></div><div class="tip" hidden></div></div>'
         f'{listed}</div><script type="application/json" id="city-data">{text}</script>'
+        # Here, so that the map is drawn before the browser has read long tables.
+        f"<script>{_asset('city.js')}</script>"
     )
 
 

@@ -1,4 +1,8 @@
-// Tables that sort by a click on a heading, and a field that finds rows.
+// Tables that sort by a click on a heading, and a field that finds rows. Most rows come when the browser is idle.
+const complete = (table) => {
+  const rest = table.parentElement.querySelector("template");
+  if (rest) { table.tBodies[0].append(rest.content); rest.remove(); }
+};
 for (const table of document.querySelectorAll("table.sortable")) {
   const body = table.tBodies[0];
   const heads = [...table.tHead.rows[0].cells];
@@ -8,6 +12,7 @@ for (const table of document.querySelectorAll("table.sortable")) {
     return cell.dataset.value !== undefined ? +cell.dataset.value : cell.textContent.trim();
   };
   const sort = (column, down) => {
+    complete(table);
     const rows = [...body.rows].map((row) => [value(row, column), row]);
     rows.sort(([a], [b]) => {
       if (a === null || b === null) return (a === null) - (b === null); // what is not known stays at the end
@@ -26,9 +31,14 @@ for (const table of document.querySelectorAll("table.sortable")) {
   });
 }
 for (const field of document.querySelectorAll("input.find")) {
-  const rows = [...document.getElementById(field.dataset.table).tBodies[0].rows];
+  const table = document.getElementById(field.dataset.table);
   field.addEventListener("input", () => {
+    complete(table);
     const wanted = field.value.toLowerCase();
-    for (const row of rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
+    for (const row of table.tBodies[0].rows) row.hidden = !row.textContent.toLowerCase().includes(wanted);
   });
 }
+(window.requestIdleCallback || setTimeout)(() => {
+  document.querySelectorAll("table.sortable").forEach(complete);
+  document.body.dataset.complete = performance.now();
+});

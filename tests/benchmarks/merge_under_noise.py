@@ -184,10 +184,10 @@ def main() -> None:
     }
     for name, (noise, correct) in CONDITIONS.items():
         found: dict[int, list[Remains]] = {count: [] for count in options.drives}
-        for place in places:
+        for where, place in enumerate(places):
             for seed in seeds:
                 drives = [
-                    mapped(frames[place, seed, number], noise, np.random.default_rng([seed, number, 1]), correct)
+                    mapped(frames[place, seed, number], noise, np.random.default_rng([seed, number, 1, where]), correct)
                     for number in range(max(options.drives))
                 ]
                 for count in options.drives:

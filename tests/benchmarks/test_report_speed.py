@@ -27,6 +27,7 @@ from tests.benchmarks.test_merge_city import city, drive
 pytestmark = pytest.mark.benchmark_only
 
 SECONDS = 3.0
+"""Within which the map is drawn; the processor has at most half of it to do."""
 TOWNS = {"karlsruhe": LocalPlane(8.4, 49.0), "munich": LocalPlane(11.5, 48.1)}
 
 
@@ -90,9 +91,13 @@ def test_a_thousand_scenes_open_quickly(tmp_path, capsys):
         page.on("pageerror", lambda error: errors.append(str(error)))
         requests: list[str] = []
         page.on("request", lambda request: requests.append(request.url))
+        client = page.context.new_cdp_session(page)
+        client.send("Performance.enable", {"timeDomain": "threadTicks"})
         page.goto(page_file.as_uri())
-        page.wait_for_selector("body[data-drawn]")
-        opened = page.evaluate("performance.now()") / 1000
+        page.wait_for_selector("body[data-drawn][data-complete]")
+        whole = page.evaluate("performance.now()") / 1000
+        drawn = float(page.evaluate("document.body.dataset.drawn")) / 1000
+        metrics = {entry["name"]: entry["value"] for entry in client.send("Performance.getMetrics")["metrics"]}
         pictures = os.environ.get("PREDMAPNET_REPORT_PICTURES")
         save = (lambda name: page.screenshot(path=Path(pictures) / name)) if pictures else (lambda name: None)
         page.wait_for_timeout(200)
@@ -121,11 +126,13 @@ def test_a_thousand_scenes_open_quickly(tmp_path, capsys):
     known = [float(value) for value in values if value]
     with capsys.disabled():
         print(
-            f"\n{count} scenes: {page_file.stat().st_size / 2**20:.1f} MB, made in {made:.1f} s, drawn {opened:.2f} s "
-            f"after the page began, a wheel step {redraw:.0f} ms"
+            f"\n{count} scenes: {page_file.stat().st_size / 2**20:.1f} MB, made in {made:.1f} s, drawn {drawn:.2f} s "
+            f"and whole {whole:.2f} s after the page began, {metrics['ProcessTime']:.2f} CPU s of the renderer; "
+            f"a wheel step {redraw:.0f} ms; load of the machine {os.getloadavg()[0]:.1f}"
         )
     assert not errors
     assert len([url for url in requests if not url.startswith(("file:", "blob:", "data:"))]) == 0
     assert known == sorted(known, reverse=True)
     assert len(known) == count
-    assert opened < SECONDS
+    assert drawn < SECONDS
+    assert metrics["ProcessTime"] < SECONDS / 2

@@ -67,3 +67,21 @@ def test_mistakes_are_one_message(predmapnet, tmp_path):
         assert result.code == 2, arguments
         assert message in result.err
         assert not (tmp_path / "a.geojson").exists()
+
+
+def test_of_more_maps_than_are_needed_it_takes_those_that_add_most_and_says_which(predmapnet, tmp_path):
+    for name, offset in (("here", (0.0, 0.0)), ("again", (0.3, 0.2)), ("there", (700.0, 0.0))):
+        write_map(street(offset), tmp_path / f"{name}.geojson", PLANE, {"note": name})
+    arguments = ("here.geojson", "again.geojson", "there.geojson", "-o", "city.geojson", "--at-most", 2)
+    result = predmapnet("merge", *arguments)
+    assert result.code == 0, result.err
+    lines = [line.split(":")[0].strip() for line in result.out.splitlines()]
+    start = lines.index("2 of 3 maps taken, what adds most first")
+    assert sorted(lines[start + 1 : start + 3]) in (["again", "there"], ["here", "there"])
+    assert lines[start + 3] == "left out, for they would add less than any of these"
+    document = json.loads((tmp_path / "city.geojson").read_text())
+    left = lines[start + 4]
+    assert document["predmapnet"]["sources"] == sorted({"here", "again", "there"} - {left})
+    assert left not in document["predmapnet"]["note"]
+    told = json.loads(predmapnet("merge", *arguments, "--json", "--force").out)
+    assert [one["name"] for one in told["choice"] if not one["taken"]] == [left]

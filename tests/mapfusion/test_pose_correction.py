@@ -52,6 +52,22 @@ def test_what_nothing_shows_stays_as_measured():
     assert abs(found[:, 1].mean() - was[:, 1].mean()) < 0.1
 
 
+def bend(poses):
+    """A kerb that bends within 20 m, as each pose has it before itself."""
+    angle = np.linspace(0.0, 1.4, 24)
+    arc = np.stack([20.0 * np.sin(angle), 20.0 * (1.0 - np.cos(angle))], axis=1)
+    return [
+        FrameMap(i, at, RegionOfInterest(), [ElementKind.BOUNDARY], [1.0], [0], (arc,)) for i, at in enumerate(poses)
+    ]
+
+
+def test_a_frame_is_not_moved_by_what_it_shows_itself():
+    """Along a bend the neighbours of a point lie on its inner side: a frame that counted its own would drift there."""
+    measured = [pose(100.0 * i, 3.0 * i, 0.2) for i in range(3)]
+    for frame, at in zip(correct_poses(bend(measured)), measured, strict=True):
+        np.testing.assert_allclose(frame.ego_to_global, at, atol=1e-12)
+
+
 def test_broken_frames_stay_as_they_are():
     frames = straight_road([pose(0.0, 0.0, 0.0), pose(4.0, 0.6, 0.0), pose(8.0, np.nan, 0.0), pose(12.0, 0.0, 0.0)])
     frames[3] = replace(frames[3], polylines=(np.full((3, 2), np.nan), np.zeros((1, 2))))

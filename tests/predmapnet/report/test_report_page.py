@@ -20,6 +20,7 @@ from mapfusion.formats.local_plane import LocalPlane
 from predmapnet.errors import UserError
 from predmapnet.report.doubts import doubtful_stretches
 from predmapnet.report.drawn_map import STEP, DrawnElement, packed, varints
+from predmapnet.report.page import ROWS_AT_ONCE, Cell, Column, sortable_table
 from predmapnet.report.places import lay_out
 from predmapnet.runs.batch_records import Outcome, write_done, write_failed
 from predmapnet.runs.fleet_report import folder_report, map_report
@@ -127,6 +128,20 @@ def test_the_page_needs_nothing_from_elsewhere_and_names_every_failure(folder):
     assert data["elements"] == 1
     assert data["rows"] == ["scene-1"]
     assert 'href="/' in folder_report(folder, out_beside=False)
+
+
+def test_the_map_is_drawn_before_long_tables_are_laid_out_and_no_row_is_lost(folder):
+    for number in range(2 * ROWS_AT_ONCE):
+        write_failed(folder, Outcome(f"bad-{number}", "failed", 1.0, error="KeyError", reason="x"))
+    html = folder_report(folder)
+    assert html.index("DecompressionStream") < html.index("<h2>Failed") < html.index("<h2>Scenes")
+    table = html[html.index("<h2>Scenes") :]
+    first, rest = table[: table.index("</table>")], table[table.index("<template>") : table.index("</template>")]
+    assert first.count("<tr") == 1 + ROWS_AT_ONCE
+    names = re.findall(r"<td class=\"text\">([^<]+)</td>", first + rest)
+    shown = [name for name in names if name.startswith("bad-")]
+    assert sorted(shown) == sorted(f"bad-{number}" for number in range(2 * ROWS_AT_ONCE))
+    assert "<template>" not in sortable_table([Column("x")], [[Cell("1", 1.0)]] * ROWS_AT_ONCE)
 
 
 def test_a_scene_is_drawn_once_whatever_formats_lie_there(folder, tmp_path):
