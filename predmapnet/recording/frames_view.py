@@ -7,7 +7,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from mapfusion.elements import FrameMap
+from mapfusion.elements import FrameMap, RegionOfInterest
 from mapfusion.geometry import rigid_pose_problem
 from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.datasets.georeference import georeference_of
@@ -33,7 +33,7 @@ class _StoredDrive:
         frame = self.frames[index]
         return Instant(frame.token, frame.timestamp, frame.ego_to_global)
 
-    def truth_map(self) -> None:
+    def truth_map(self, roi: RegionOfInterest) -> None:
         """A file of results has none."""
 
 

@@ -51,8 +51,8 @@ class Drive(Protocol):
     def instant(self, index: int) -> Instant:
         """Return time stamp and pose of frame ``index``."""
 
-    def truth_map(self) -> GlobalMap | None:
-        """Return the ground truth in the global frame, or None."""
+    def truth_map(self, roi: RegionOfInterest) -> GlobalMap | None:
+        """Return the true map of what came into the region, global frame, or None."""
 
 
 class SceneRecorder:
