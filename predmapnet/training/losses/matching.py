@@ -219,11 +219,10 @@ def match(
     pairs: list[list[Integers]] = [[] for _ in deciding]
     for stream, (start, end) in enumerate(zip(truth.begin[:-1], truth.begin[1:], strict=True)):
         pieces = slice(start, end)
-        kept, kept_pieces = owners.pieces_in_sight(
-            stream, valid[stream, :tracks], truth.kinds[pieces], truth.element_ids[pieces], apart[stream], exclusive
-        )
-        free = tracks + np.flatnonzero(valid[stream, tracks:])
         offered = np.arange(end - start)
+        own = truth.kinds[pieces], truth.element_ids[pieces], apart[stream][:, offered]
+        kept, kept_pieces = owners.pieces_in_sight(stream, valid[stream, :tracks], *own, exclusive)
+        free = tracks + np.flatnonzero(valid[stream, tracks:])
         if exclusive:
             offered = np.setdiff1d(offered, kept_pieces)
         for cost, found in zip(on_host[:-3], pairs, strict=True):

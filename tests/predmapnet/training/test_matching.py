@@ -168,3 +168,20 @@ def test_more_truth_than_detections_and_losses_that_are_no_numbers_still_give_an
         assert pairs.row.tolist() == [0, 1, 2]
         assert pairs.truth.tolist()[:2] == [0, 1]
         assert not exclusive or pairs.truth[2] >= 2
+
+
+@pytest.mark.parametrize("exclusive", [False, True])
+def test_tracks_answer_for_the_nearest_piece_of_their_own_stream_however_many_pieces_others_have(
+    exclusive: bool,
+) -> None:
+    """An element of the stream with less truth is in two pieces; the track stands on the second one."""
+    generator = np.random.default_rng(0)
+    near, far = np.array([[5.0, 1.0], [25.0, 1.0]]), np.array([[-25.0, 1.0], [-8.0, 1.0]])
+    cut = FrameTruth(np.array([1, 1]), (far, near), np.array([4, 4]))
+    truth = truth_of(cut, random_truth(generator, 5))
+    points = torch.rand(2, 3, POINTS, 2)
+    points[0, 0] = truth.targets.points[1]
+    owners = TrackTruth(np.array([[1], [truth.kinds[4]]]), np.array([[4], [2]]))
+    pairs = pairs_of(torch.zeros(2, 3, 3), points, truth, owners=owners, exclusive=exclusive)
+    by_track = {int(frame): int(piece) for frame, row, piece in zip(*vars(pairs).values(), strict=True) if row == 0}
+    assert by_track == {0: 1, 1: 4}
