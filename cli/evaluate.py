@@ -102,23 +102,29 @@ def evaluate(
     """
     from cli.console import err, out, print_json, progress_display, say_warning
     from predmapnet import __version__
+    from predmapnet.errors import UserError
     from predmapnet.files import check_output
     from predmapnet.sources import folder_named
 
     if results is not None and (folder := folder_named(str(results), None)) is not None:
         results, (dataset, data_root) = None, folder
+    if results is not None and weights is not None:
+        raise UserError("--weights is for scenes that are mapped; results are measured as they are.")
     to_stdout = json_file == STDOUT
     for path, endings in ((None if to_stdout else json_file, (".json",)), (report, (".html", ".htm"))):
         if path is not None:
             check_output(path, endings, [] if results is None else [results])
     threads = max(1, available_cores() // jobs)
     use_threads(threads)
+    import numpy as np
+
     from predmapnet.demo_world.catalogue import default_cache
+    from predmapnet.evaluation.class_order import check_class_order
     from predmapnet.evaluation.measurement import pool_scenes
     from predmapnet.evaluation.recognition import split_of, warnings_of
     from predmapnet.evaluation.report import write_figures, write_report
     from predmapnet.evaluation.scene_figures import scene_figures
-    from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, scenes_to_measure
+    from predmapnet.runs.evaluate import EvaluationSettings, measure_scenes, notes_of, scenes_to_measure
     from predmapnet.runs.place_maps import place_matches
 
     settings = EvaluationSettings(
@@ -139,13 +145,15 @@ def evaluate(
     scenes = scenes_to_measure(settings, source, split)
     found_split, in_split = split_of(source.scenes(), scenes)
     world = "demo" if source.synthetic else source.name
-    warnings = warnings_of(world, split_scheme.value, found_split, len(scenes), in_split)
+    warnings = warnings_of(world, split_scheme.value, found_split, len(scenes), in_split) + notes_of(settings, source)
     measured = []
     with progress_display() as display:
         display.scenes(0, len(scenes))
         for measurement in measure_scenes(settings, scenes, jobs, display.preparing):
             measured.append(measurement)
             display.scenes(len(measured), len(scenes))
+    if results is not None:
+        check_class_order(results, np.sum([scene.kinds for scene in measured], axis=0))
     total = pool_scenes(measured, place_matches(source, measured))
     context = _context(source, total, found_split, in_split) | {
         "split_scheme": split_scheme.value,

@@ -28,8 +28,8 @@ class EvaluationFrame:
         truth: ground truth of the same ROI, in the ego frame, not simplified.
 
     Raises:
-        UserError: a polyline is empty or not finite, a forecast or a score is not finite, or a kind does not exist; the
-            message names the scene, the frame and the element.
+        UserError: a polyline is empty or not finite, a forecast is not finite, a score is not from 0 to 1, or a kind
+            does not exist; the message names the scene, the frame and the element.
     """
 
     scene: str
@@ -44,10 +44,10 @@ class EvaluationFrame:
         for row, points in enumerate(self.predicted.forecasts or ()):
             if not np.isfinite(points).all():
                 raise UserError(f"{where}, forecast {row}: the polyline holds NaN or infinite coordinates.")
-        bad = np.flatnonzero(~np.isfinite(self.predicted.scores))
+        bad = np.flatnonzero(~((self.predicted.scores >= 0.0) & (self.predicted.scores <= 1.0)))
         if len(bad):
             score = self.predicted.scores[bad[0]]
-            raise UserError(f"{where}, prediction {bad[0]}: the score is {score}, not a finite number.")
+            raise UserError(f"{where}, prediction {bad[0]}: the score is {score}, not a number from 0 to 1.")
 
     @property
     def name(self) -> str:

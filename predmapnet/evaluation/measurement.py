@@ -11,6 +11,7 @@ from mapfusion.elements import GlobalMap, RegionOfInterest
 from predmapnet.errors import UserError
 from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
 from predmapnet.evaluation.chamfer_ap import frame_matches, thresholds_for
+from predmapnet.evaluation.class_order import kinds_found
 from predmapnet.evaluation.consistency_ap import consistency_matches, matched_tracks, with_formed_tracks
 from predmapnet.evaluation.forecast import ForecastErrors, forecast_errors, pool_forecasts
 from predmapnet.evaluation.frames import EvaluationFrame
@@ -48,6 +49,8 @@ class SceneMeasurement:
         identity: id switches and track lengths.
         forecast: errors of the forecasts.
         protocol, instances: of the stability.
+        kinds: of predictions and of the truth on which they lie, see
+            :func:`predmapnet.evaluation.class_order.kinds_found`.
         global_map, global_matches: None where there is no global map or no true one.
         mapping_seconds: wall time of mapping; None where results were read.
         absent_frames: frames that the results lack, measured as empty ones.
@@ -69,6 +72,7 @@ class SceneMeasurement:
     forecast: ForecastErrors
     protocol: Protocol
     instances: SceneInstances
+    kinds: Integer
     global_map: GlobalMapQuality | None
     global_matches: Matches | None
     mapping_seconds: float | None = None
@@ -204,6 +208,7 @@ def measure_scene(
         forecast=forecast_errors(frames),
         protocol=protocol,
         instances=scene_instances(frames, _element_ids(frames, truth_ids), protocol),
+        kinds=kinds_found(frames),
         global_map=quality,
         global_matches=global_matches,
         mapping_seconds=mapping_seconds,
@@ -218,8 +223,10 @@ def pool_scenes(scenes: Sequence[SceneMeasurement], places: Sequence[Matches] | 
     """
     if not scenes:
         raise UserError("There is no scene to measure.")
-    if len({scene.thresholds for scene in scenes}) > 1:
-        raise UserError("The scenes have regions of interest of different sizes; measure them apart.")
+    regions = {frame.predicted.roi for scene in scenes for frame in scene.frames}
+    if len(regions) > 1:
+        sizes = " and ".join(sorted(f"{roi.length:g} m x {roi.width:g} m" for roi in regions))
+        raise UserError(f"The scenes have regions of interest of different sizes ({sizes}); measure them apart.")
     if len({scene.weights_sha256 for scene in scenes}) > 1:
         raise UserError("The scenes were mapped with different weights; measure each method apart.")
     thresholds = scenes[0].thresholds

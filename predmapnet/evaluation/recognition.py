@@ -14,6 +14,8 @@ from predmapnet.scenes import STANDARD_REGION, SceneInfo
 
 STANDARD, WIDE = STANDARD_REGION, RegionOfInterest(100.0, 50.0)
 """Regions of the benchmarks."""
+TELLING = 3
+"""Elements that a frame must hold to be asked for its region."""
 OVERSHOOT = 1.0
 """Metres by which an element may leave its region."""
 FEW, MANY = 0.1, 0.2
@@ -26,11 +28,13 @@ _OVERLAP = {
 """As counted by Lilja et al., *Localization Is All You Evaluate* (CVPR 2024)."""
 
 
-def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
-    """Recognise the region for which elements (``(k, 2)`` each, metres, ego frame) were made.
+def region_of(path: Path, frames: Sequence[Sequence[Float]]) -> RegionOfInterest:
+    """Recognise the region for which the elements of frames (``(k, 2)`` each, metres, ego frame) were made.
 
-    Raises UserError where the axes are not x forward and y left, or they fit neither region of the benchmarks.
+    Raises UserError where the axes are not x forward and y left, they fit neither region of the benchmarks, or some
+    frames fit one and some the other.
     """
+    polylines = [line for lines in frames for line in lines]
     if not polylines:
         return STANDARD
     away = np.abs(np.concatenate(polylines))
@@ -43,8 +47,15 @@ def region_of(path: Path, polylines: Sequence[Float]) -> RegionOfInterest:
         )
     if along <= FEW:
         return STANDARD
-    if along >= MANY and _beyond(away, WIDE) <= FEW:
+    telling = [np.abs(np.concatenate(lines)) for lines in frames if len(lines) >= TELLING]
+    narrow = sum(_beyond(frame, STANDARD) == 0.0 for frame in telling)
+    if along >= MANY and _beyond(away, WIDE) <= FEW and narrow <= MANY * len(telling):
         return WIDE
+    if narrow:
+        raise UserError(
+            f"{path}: {narrow} of {len(telling)} frames keep within 60 m x 30 m, the others do not. Are frames of two "
+            "regions mixed? If not, say the region with --roi."
+        )
     raise UserError(
         f"{path}: {100 * along:.0f} % of the vertices lie outside 60 m x 30 m and {100 * _beyond(away, WIDE):.0f} % "
         "outside 100 m x 50 m, so it cannot be told for which region they were made. Are frames of two regions mixed? "
@@ -68,6 +79,12 @@ def frames_look_like(names: Iterable[str]) -> str | None:
     if len(kinds) > 1 and None not in kinds:
         return "a mixture of nuScenes and Argoverse 2"
     return kinds.pop() if len(kinds) == 1 else None
+
+
+def looks_foreign(dataset: str, name: str) -> bool:
+    """Whether a frame is named as in another public data set than ``dataset`` (``nuscenes`` or ``argoverse2``)."""
+    own = {"nuscenes": "nuScenes", "argoverse2": "Argoverse 2"}
+    return dataset in own and _kind_of_name(name) not in (None, own[dataset])
 
 
 def split_of(infos: Sequence[SceneInfo], scenes: Sequence[str]) -> tuple[str, int]:
@@ -112,6 +129,6 @@ def _beyond(away: Float, roi: RegionOfInterest) -> float:
 
 def _kind_of_name(name: str) -> str | None:
     last = name.rsplit("_", 1)[-1]
-    if last.isdigit() and len(last) >= 16:
+    if last.isdigit() and 16 <= len(last) <= 19:
         return "Argoverse 2"
     return "nuScenes" if len(name) == 32 and set(name) <= set("0123456789abcdef") else None

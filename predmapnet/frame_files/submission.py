@@ -33,7 +33,9 @@ from predmapnet.frame_files.parquet import refuse_pickle
 from predmapnet.scenes import Instant
 
 _ENOUGH_TO_JUDGE = 10
-"""Number of elements from which on a file whose points all lie in [0, 1] is taken to be normalised."""
+"""Number of elements from which on frames whose points all lie in [0, 1] are taken to be normalised."""
+_NORMALISED_REACH = 0.55
+"""Normalised coordinates lie this close to 0.5; they may leave [0, 1] a little."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +78,12 @@ def position_name(scene: str, index: int) -> str:
     return f"{scene}/{index}"
 
 
-def read_submission(path: Path) -> dict[str, SubmittedFrame]:
+def read_submission(path: Path, notes: list[str] | None = None) -> dict[str, SubmittedFrame]:
     """Read a submission in one of the layouts above.
 
     Args:
         path: JSON file.
+        notes: receives what was left out.
 
     Returns:
         The frames by the data set's token, or by :func:`position_name`.
@@ -95,7 +98,7 @@ def read_submission(path: Path) -> dict[str, SubmittedFrame]:
             "whose axes on nuScenes are the lidar's. Convert it first: labels by cls_name to 0 ped_crossing, "
             "1 divider, 2 boundary, and on nuScenes (x, y) to (y, -x)."
         )
-    return submitted_frames(path, results)
+    return submitted_frames(path, results, notes)
 
 
 def submitted_frames(
@@ -248,9 +251,16 @@ def _polyline(where: str, vector: Any) -> Float:
 
 
 def _check_metres(path: Path, frames: Mapping[str, SubmittedFrame]) -> None:
-    lines = [line for frame in frames.values() for line in frame.polylines]
-    if len(lines) >= _ENOUGH_TO_JUDGE and all(((line >= 0.0) & (line <= 1.0)).all() for line in lines):
+    held = [frame.polylines for frame in frames.values() if frame.polylines]
+    normalised = [lines for lines in held if all((np.abs(line - 0.5) <= _NORMALISED_REACH).all() for line in lines)]
+    if sum(map(len, normalised)) < _ENOUGH_TO_JUDGE:
+        return
+    if len(normalised) < len(held):
         raise UserError(
-            f"{path}: all points lie between 0 and 1, so they are normalised; metres are expected. "
-            "integrate reads them with --normalised, as shares of the sides of the region (--roi)."
+            f"{path} mixes frames in metres with normalised ones: in {len(normalised)} of {len(held)} frames with "
+            "elements, all points lie between 0 and 1. Metres are expected."
         )
+    raise UserError(
+        f"{path}: all points lie between 0 and 1, so they are normalised; metres are expected. "
+        "integrate reads them with --normalised, as shares of the sides of the region (--roi)."
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -16,9 +17,9 @@ from mapfusion.integrate.integrator import MapIntegrator
 from predmapnet.errors import UserError
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
-from predmapnet.evaluation.recognition import check_region, frames_look_like, region_of
+from predmapnet.evaluation.recognition import check_region, frames_look_like, looks_foreign, region_of
 from predmapnet.evaluation.stability_protocol import Protocol
-from predmapnet.frame_files.parquet import read_frames, stored_scenes
+from predmapnet.frame_files.parquet import read_frames, refuse_pickle, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
 from predmapnet.machine import NetworkOptions, use_threads
 from predmapnet.mapping import NETWORK_ERRORS
@@ -98,10 +99,12 @@ def submitted_region(results: Path, stated: RegionOfInterest | None) -> RegionOf
     Raises:
         UserError: the submission is broken, mixes regions or has other axes, or contradicts what was stated.
     """
-    polylines = [line for frame in _submission(results).values() for line in frame.polylines if np.isfinite(line).all()]
+    frames = [
+        [line for line in frame.polylines if np.isfinite(line).all()] for frame in _submission(results).frames.values()
+    ]
     if stated is None:
-        return region_of(results, polylines)
-    check_region(results, polylines, stated)
+        return region_of(results, frames)
+    check_region(results, [line for lines in frames for line in lines], stated)
     return stated
 
 
@@ -149,7 +152,9 @@ def _measure(
         maps = _pair(run.global_map, truth_map)
         return replace(measured, weights_sha256=_mapper(settings).weights_sha256, maps=maps)
     if submitted is not None:
-        found = _Found(_submitted_maps(submitted, settings.roi, scene), len(scene) - len(submitted), None)
+        found = _Found(
+            _submitted_maps(settings.results, submitted, settings.roi, scene), len(scene) - len(submitted), None
+        )
     else:
         found = _stored_maps(settings.results, scene, _source(settings).name)
     frames = _with_truth(scene, found.maps, settings.cache)
@@ -184,21 +189,40 @@ def _mapper(settings: EvaluationSettings) -> Mapper:
     return Mapper.from_checkpoint(settings.network)
 
 
-def _submission(path: Path) -> Submitted:
+@dataclass(frozen=True)
+class _Submission:
+    """Frames by name, and notes on what of them was left out."""
+
+    frames: Submitted
+    notes: tuple[str, ...]
+
+
+def _submission(path: Path) -> _Submission:
     return _read_submission(path, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
-def _read_submission(path: Path, changed: int) -> Submitted:
+def _read_submission(path: Path, changed: int) -> _Submission:
     """Read a submission once for as long as it does not change (``changed``: when it was written)."""
-    return read_submission(path)
+    notes: list[str] = []
+    return _Submission(read_submission(path, notes), tuple(notes))
+
+
+def notes_of(settings: EvaluationSettings, source: SceneSource) -> list[str]:
+    """Return what of a submission is not measured: elements of other classes, and frames that the data set lacks."""
+    if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
+        return []
+    submission = _submission(settings.results)
+    lost = len(submission.frames) - len(_scene_by_name(submission.frames, source))
+    unknown = f"{lost} of {len(submission.frames)} frames of the results are not in {source.name} and are left out"
+    return [*submission.notes, *([unknown] if lost else [])]
 
 
 def _submitted_of(settings: EvaluationSettings, scenes: Sequence[str]) -> dict[str, Submitted]:
     """Frames of a submission by scene: it is read once, each process gets its share. Empty for our own files."""
     if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
         return {}
-    submission = _submission(settings.results)
+    submission = _submission(settings.results).frames
     of_scene: dict[str, Submitted] = {scene: {} for scene in scenes}
     for name, scene in _scene_by_name(submission, _source(settings)).items():
         if scene in of_scene:
@@ -221,12 +245,19 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
                 f"The folder {results} holds no per-frame results (*.parquet); "
                 "make them with 'predmapnet batch --save-frames'."
             )
+        for name in sorted(names):
+            others = [scene for scene in stored_scenes(results / f"{name}.parquet") if scene != name]
+            if others:
+                raise UserError(
+                    f"{results / name}.parquet holds frames of {others[0]}, too; a file has one scene here."
+                )
         return names
     if results.suffix == ".json":
-        submission = _submission(results)
+        submission = _submission(results).frames
         scenes = _scene_by_name(submission, source)
         unknown = [name for name in submission if name not in scenes]
-        if not scenes or (unknown and every_frame):
+        foreign = any(looks_foreign(source.name, name) for name in unknown)
+        if not scenes or (unknown and every_frame) or foreign:
             example = f", {unknown[0]} for one" if unknown else ""
             looks = frames_look_like(unknown)
             example += f"; by their names they are {looks}" if looks else ""
@@ -236,16 +267,21 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
                 f"{example}. Name another data set, or a --split to measure only that.{hint}"
             )
         return set(scenes.values())
+    if results.suffix != ".parquet":
+        refuse_pickle(results)
+        raise UserError(f"{results} holds no per-frame results: .parquet, .json or a folder is expected.")
     return set(stored_scenes(results))
 
 
-def _submitted_maps(submitted: Submitted, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
+def _submitted_maps(path: Path, submitted: Submitted, roi: RegionOfInterest, scene: Scene) -> list[FrameMap]:
     """Return a submission's predictions for each frame of a scene; a frame that it lacks has none."""
     maps = []
     for index in range(len(scene)):
         instant = scene.instant(index)
-        names = (instant.token, str(instant.timestamp), position_name(scene.info.name, index))
-        found = next((submitted[name] for name in names if name in submitted), NOTHING)
+        names = {instant.token, str(instant.timestamp), position_name(scene.info.name, index)} & submitted.keys()
+        if len(names) > 1:
+            raise UserError(f"{path} holds frame {index} of {scene.info.name} as {' and as '.join(sorted(names))}.")
+        found = submitted[names.pop()] if names else NOTHING
         maps.append(found.at(instant, roi))
     return maps
 
@@ -256,6 +292,9 @@ def _stored_maps(results: Path, scene: Scene, dataset: str) -> _Found:
     path = results / f"{name}.parquet" if results.is_dir() else results
     content = read_frames(path, name)
     stored = {frame.index: frame.frame_map for frame in content.frames}
+    if len(stored) < len(content.frames):
+        twice, _ = Counter(frame.index for frame in content.frames).most_common(1)[0]
+        raise UserError(f"{path} holds frame {twice} of {name} twice.")
     if not stored:
         raise UserError(f"{path} holds no frame of {name}.")
     if max(stored) >= len(scene) or min(stored) < 0:

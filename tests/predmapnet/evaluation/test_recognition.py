@@ -14,6 +14,7 @@ from predmapnet.evaluation.recognition import (
     WIDE,
     check_region,
     frames_look_like,
+    looks_foreign,
     region_of,
     split_of,
     warnings_of,
@@ -32,29 +33,29 @@ def elements(roi, count=40, seed=0):
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from([STANDARD, WIDE]), st.integers(0, 1000))
 def test_the_region_is_recognised_by_its_elements(roi, seed):
-    assert region_of(PATH, elements(roi, seed=seed)) == roi
+    assert region_of(PATH, [elements(roi, seed=seed)]) == roi
 
 
 def test_overshoots_do_not_make_another_region():
     lines = elements(STANDARD)
     lines[0] = lines[0] + np.array([6.0, 0.0])
-    assert region_of(PATH, lines) == STANDARD
+    assert region_of(PATH, [lines]) == STANDARD
     assert region_of(PATH, []) == STANDARD
 
 
 def test_frames_of_two_regions_are_refused():
     with pytest.raises(UserError, match="mixed"):
-        region_of(PATH, [*elements(STANDARD, 90), *elements(WIDE, 30)])
+        region_of(PATH, [elements(STANDARD, 90), elements(WIDE, 30)])
 
 
 def test_elements_of_an_unknown_region_are_refused():
     with pytest.raises(UserError, match="cannot be told"):
-        region_of(PATH, elements(RegionOfInterest(200.0, 100.0)))
+        region_of(PATH, [elements(RegionOfInterest(200.0, 100.0))])
 
 
 def test_axes_x_right_and_y_forward_are_refused():
     with pytest.raises(UserError, match=r"\(x, y\) becomes \(y, -x\)"):
-        region_of(PATH, [line[:, ::-1] for line in elements(STANDARD)])
+        region_of(PATH, [[line[:, ::-1] for line in elements(STANDARD)]])
 
 
 def test_a_stated_region_that_the_elements_leave_is_refused():
@@ -91,3 +92,24 @@ def test_old_splits_come_with_their_overlap_and_parts_with_their_size():
     assert warnings_of("demo", "old", "test", 10, 10) == []
     assert "2 of the 150 scenes" in warnings_of("argoverse2", "new", "val", 2, 150)[0]
     assert "training split" in warnings_of("nuscenes", "old", "train", 5, 5)[0]
+
+
+def test_wide_frames_among_narrow_ones_are_refused_whatever_their_share():
+    narrow, wide = [elements(STANDARD, 9, seed) for seed in range(10)], [elements(WIDE, 9, seed) for seed in range(10)]
+    assert region_of(PATH, wide) == WIDE
+    assert region_of(PATH, [*wide, narrow[0]]) == WIDE, "one frame on a narrow road"
+    for frames in ([*wide, *narrow], [*wide[:6], *narrow], [*wide, *narrow[:4]]):
+        with pytest.raises(UserError, match="--roi"):
+            region_of(PATH, frames)
+
+
+def test_a_frame_of_another_data_set_is_told_from_one_that_is_lacking():
+    sample, sweep = "ca9a282c9e77460f8360f564131a8af5", "315967376859506000"
+    assert looks_foreign("nuscenes", sweep) and looks_foreign("argoverse2", sample)
+    assert not any(looks_foreign(dataset, "scene-0001/3") for dataset in ("nuscenes", "argoverse2", "demo", "log"))
+    assert not looks_foreign("nuscenes", sample) and not looks_foreign("argoverse2", sweep)
+    assert not looks_foreign("demo", sample) and not looks_foreign("log", f"mine_{sweep}")
+
+
+def test_a_number_of_many_digits_is_no_time():
+    assert frames_look_like(["0" * 32]) == "nuScenes"
