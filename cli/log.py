@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli.options import Json
 from cli.plain_help import PlainCommand
+
+if TYPE_CHECKING:
+    from predmapnet.datasets.own_logs.made_log import MadeLog
 
 log = typer.Typer(name="log", help="Make logs of your own from recordings.", no_args_is_help=True)
 
@@ -54,18 +57,48 @@ def from_bag(
     Images, camera infos, transforms and odometry become images by camera and time, calibration.json and poses.csv.
     `predmapnet infer FOLDER` maps them (docs/own-logs.md). What was left out or lost is said.
     """
-    from cli.console import counted, print_json, progress_display, say_notes
-    from cli.console import out as console
+    from cli.console import progress_display
     from predmapnet.datasets.bags.conversion import BagOptions, log_from_bag
 
     options = BagOptions(tuple(camera_topics or ()), base_frame, poses, height)
     with progress_display() as display:
-        report = log_from_bag(bag, out, options, display.preparing)
+        made = log_from_bag(bag, out, options, display.preparing)
+    _say(made, as_json)
+
+
+@log.command("from-py123d", cls=PlainCommand)
+def from_py123d(
+    folder: Annotated[Path, typer.Argument(help="Log folder of py123d (logs/SPLIT/LOG).", metavar="FOLDER")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log to make.")],
+    cameras: Annotated[
+        list[str] | None,
+        typer.Option("--camera", help="Camera to take; can be repeated. Default: all pinholes.", show_default=False),
+    ] = None,
+    sensor_root: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the images, for logs that only name them.", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a log of your own from a log of py123d (the package is not needed)."""
+    from cli.console import progress_display
+    from predmapnet.datasets.py123d_logs import log_from_py123d
+
+    with progress_display() as display:
+        made = log_from_py123d(folder, out, tuple(cameras or ()), sensor_root, display.preparing)
+    _say(made, as_json)
+
+
+def _say(made: MadeLog, as_json: bool) -> None:
+    """Print what was made of a recording."""
+    from cli.console import counted, print_json, say_notes
+    from cli.console import out as console
+
     if as_json:
-        print_json(asdict(report))
+        print_json(asdict(made))
     else:
-        for name, topic in report.cameras.items():
-            console.print(f"{name}: {counted(report.images[name], 'image')} of {topic}", markup=False)
-        console.print(f"poses: {report.poses}", markup=False)
-        console.print(f"written: {report.written} (check it: predmapnet scenes --check {report.written})", markup=False)
-    say_notes(report.notes, {})
+        for name, source in made.cameras.items():
+            console.print(f"{name}: {counted(made.images[name], 'image')} of {source}", markup=False)
+        console.print(f"poses: {made.poses}", markup=False)
+        console.print(f"written: {made.written} (check it: predmapnet scenes --check {made.written})", markup=False)
+    say_notes(made.notes, {})

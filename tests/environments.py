@@ -9,6 +9,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+PY123D = (
+    "--no-deps py123d==0.7.0",
+    "numpy pandas scipy pyarrow shapely networkx msgpack trimesh pyproj requests pillow opencv-python-headless rtree "
+    "typing_extensions pyyaml ray psutil laspy lazrs cachetools pyquaternion mapbox-earcut omegaconf hydra-core "
+    "DracoPy tqdm",
+)
+"""Packages for :func:`python_with` of py123d, without its viewer and notebooks."""
+
 
 def python_with(name: str, folder: Path, *packages: str) -> Path:
     """Return the Python of an environment with packages, made below ``folder`` unless it is kept."""

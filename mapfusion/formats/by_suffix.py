@@ -23,6 +23,7 @@ from mapfusion.formats.local_plane import LocalPlane, common_plane
 from mapfusion.formats.nuscenes_expansion import read_nuscenes, write_nuscenes
 from mapfusion.formats.opendrive import write_opendrive
 from mapfusion.formats.opendrive_reader import read_opendrive
+from mapfusion.formats.py123d_map import read_py123d, write_py123d
 from mapfusion.formats.reference_systems import FromDegrees
 from mapfusion.georeference import LOCAL_FRAME, Georeference, InvertibleGeoreference
 
@@ -35,6 +36,7 @@ SUFFIXES = {
     ".xodr": "OpenDRIVE",
     ".nuscenes.json": "nuScenes",
     ".argoverse2.json": "Argoverse 2",
+    ".arrow": "py123d",
 }
 """Endings of the files that hold maps, and the format of each; where several fit, the longest counts."""
 
@@ -46,6 +48,7 @@ _WRITERS = {
     "OpenDRIVE": write_opendrive,
     "nuScenes": write_nuscenes,
     "Argoverse 2": write_argoverse2,
+    "py123d": write_py123d,
 }
 _READERS = {
     "GeoJSON": read_geojson,
@@ -55,6 +58,7 @@ _READERS = {
     "OpenDRIVE": read_opendrive,
     "nuScenes": read_nuscenes,
     "Argoverse 2": read_argoverse2,
+    "py123d": read_py123d,
 }
 
 

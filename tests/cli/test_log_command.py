@@ -1,4 +1,4 @@
-"""``predmapnet log from-bag`` as a user meets it: a bag becomes a log, and the log a map."""
+"""``predmapnet log`` as a user meets it: a recording becomes a log, and the log a map."""
 
 import json
 
@@ -7,6 +7,7 @@ import pytest
 from mapfusion.formats.by_suffix import read_map
 from tests.predmapnet.datasets.bags.drawn_bag import bag_of
 from tests.predmapnet.datasets.own_logs.drawn_log import bend, entry, write_log
+from tests.predmapnet.datasets.test_py123d_logs import CAMERAS, write_py123d
 
 TOPIC = "/sensing/front/image_raw/compressed"
 
@@ -44,3 +45,13 @@ def test_a_bag_that_lacks_something_is_one_message(predmapnet, drawn, tmp_path):
     assert "no transform leads from front_optical to base_link" in result.err
     assert "/sensing/left/camera_info (sensor_msgs/msg/CameraInfo)" in result.err
     assert not (tmp_path / "drive").exists()
+
+
+def test_a_log_of_py123d_becomes_a_log(predmapnet, tmp_path):
+    write_py123d(write_log(tmp_path / "drawn", CAMERAS, bend(12)), tmp_path / "py123d")
+    result = predmapnet("log", "from-py123d", "py123d", "--out", "drive", "--camera", "pcam_f0")
+    assert result.code == 0, result.err
+    assert "pcam_f0: 12 images of camera.pcam_f0.arrow\n" in result.out and "pcam_l0" not in result.out
+    assert "poses: ego_state_se3.arrow, 12 poses, 10 Hz" in result.out
+    assert predmapnet("scenes", "--data-root", "drive").code == 0
+    assert predmapnet("log", "from-py123d", "drawn", "--out", "other").code == 2

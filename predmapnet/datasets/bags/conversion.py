@@ -11,10 +11,10 @@ from predmapnet.datasets.bags.cameras import BagCamera, cameras_of
 from predmapnet.datasets.bags.contents import Contents, Reader, contents_of
 from predmapnet.datasets.bags.image_messages import image_file
 from predmapnet.datasets.bags.storage import Bag, BytesRead
-from predmapnet.datasets.own_logs.calibration import CALIBRATION, read_calibration, write_calibration
+from predmapnet.datasets.own_logs.calibration import CALIBRATION, write_calibration
+from predmapnet.datasets.own_logs.made_log import MadeLog, check_made_log, count_and_rate
 from predmapnet.datasets.own_logs.pose_files import POSE_FILES
-from predmapnet.datasets.own_logs.scene import LogScene
-from predmapnet.datasets.own_logs.timed_poses import TimedPoses, write_timed_poses
+from predmapnet.datasets.own_logs.timed_poses import write_timed_poses
 from predmapnet.errors import UserError
 from predmapnet.files import whole_folder
 from predmapnet.scenes import Progress
@@ -37,28 +37,9 @@ class BagOptions:
     height: float | None = None
 
 
-@dataclass(frozen=True)
-class BagReport:
-    """What was written.
-
-    Attributes:
-        cameras: image topic of each camera.
-        images: images of each camera.
-        poses: what says where the car was, and how often.
-        notes: what was guessed, left out or lost.
-        written: the folder.
-    """
-
-    cameras: dict[str, str]
-    images: dict[str, int]
-    poses: str
-    notes: list[str]
-    written: Path
-
-
 def log_from_bag(
     path: Path, out: Path, options: BagOptions | None = None, progress: Progress = lambda done, total, what: None
-) -> BagReport:
+) -> MadeLog:
     """Write a log of one's own (docs/own-logs.md) from a bag.
 
     Args:
@@ -86,11 +67,7 @@ def log_from_bag(
         write_calibration(draft / CALIBRATION, entries, height or 0.0)
         write_timed_poses(draft / POSE_FILES[0], poses)
         lost = _write_images(bag, reader, found, cameras, draft, progress)
-        try:
-            read_calibration(draft / CALIBRATION)
-            LogScene(draft)
-        except UserError as error:
-            raise UserError(f"{path}: {str(error).replace(str(draft), str(out))}") from None
+        check_made_log(draft, out, path)
         images = {name: len(list((draft / "images" / name).iterdir())) for name in entries}
     notes = [f"left out: {reason}" for reason in left_out]
     notes += [note for camera in cameras for note in camera.notes]
@@ -105,7 +82,7 @@ def log_from_bag(
         notes.append(f"{found.graph.wrong} transforms are no rigid motion and are left out")
     notes += [*(f"lost: {damage}" for damage in bag.damage), *lost]
     topics = {camera.name: camera.images.topic for camera in cameras}
-    return BagReport(topics, images, f"{source}, {_rate(poses)}", notes, out)
+    return MadeLog(topics, images, f"{source}, {count_and_rate(poses)}", notes, out)
 
 
 def _cameras(bag: Bag, found: Contents, base: str, asked: Sequence[str]) -> tuple[list[BagCamera], list[str]]:
@@ -145,12 +122,6 @@ def _write_images(
             for topic, count in sorted(damaged.items())]  # fmt: skip
     return lost + [f"{topic}: {count} images have the time of another one, which they replace"
                    for topic, count in sorted(repeated.items()) if count]  # fmt: skip
-
-
-def _rate(poses: TimedPoses) -> str:
-    seconds = (poses.timestamps[-1] - poses.timestamps[0]) / 1e9
-    count = len(poses.timestamps)
-    return f"{count:,} poses, {(count - 1) / seconds:.0f} Hz" if count > 1 else "one pose"
 
 
 def _megabytes(progress: Progress, what: str) -> BytesRead:

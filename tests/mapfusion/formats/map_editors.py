@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from xml.etree import ElementTree
 
+import msgpack
 import numpy as np
+import pyarrow as pa
 import pyogrio
 import shapely
 from pyogrio import raw
@@ -148,6 +150,23 @@ def edit_argoverse2(path: Path, plane: LocalPlane) -> None:
     path.write_text(json.dumps(document))
 
 
+def edit_py123d(path: Path, plane: LocalPlane) -> None:
+    """Edit the rows of a py123d map; the added one is a road line (layer 9) as py123d writes it."""
+    table = pa.ipc.open_file(path.read_bytes()).read_all()
+    rows = [row for row in table.to_pylist() if b'"gone"' not in row["features"]]
+    for row in rows:
+        if b'"kerb"' in row["features"]:
+            points = shapely.get_coordinates(shapely.from_wkb(row["wkb"]), include_z=True)
+            points[1, :2] += SHIFT
+            row["wkb"] = shapely.to_wkb(shapely.LineString(points))
+    line = shapely.LineString(np.column_stack([ADDED, np.zeros(2)]))
+    features = msgpack.packb({"road_line_type": 11})
+    rows.append({"object_id": 7, "map_layer": 9, "features": features, "wkb": shapely.to_wkb(line)})
+    lane = {"object_id": 8, "map_layer": 0, "features": msgpack.packb({}), "wkb": shapely.to_wkb(line.buffer(2.0))}
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(pa.Table.from_pylist([*rows, lane], schema=table.schema))
+
+
 EDITORS = {
     ".geojson": edit_with_gdal,
     ".gpkg": edit_with_gdal,
@@ -156,4 +175,5 @@ EDITORS = {
     ".xodr": edit_roads,
     ".nuscenes.json": edit_nuscenes,
     ".argoverse2.json": edit_argoverse2,
+    ".arrow": edit_py123d,
 }

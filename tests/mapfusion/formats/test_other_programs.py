@@ -1,4 +1,4 @@
-"""The official devkits of nuScenes and Argoverse 2 and readers of OpenDRIVE open our maps and see what is in them."""
+"""The devkits of nuScenes and Argoverse 2, py123d and readers of OpenDRIVE open our maps and see what is in them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shapely
 from mapfusion import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import write_map
 from mapfusion.formats.local_plane import LocalPlane
-from tests.environments import printed_json, python_with
+from tests.environments import PY123D, printed_json, python_with
 
 pytestmark = pytest.mark.devkit
 
@@ -60,6 +60,18 @@ def test_the_av2_package_opens_the_map(tmp_path):
     crossing = shapely.Polygon(np.array(seen["crossing"])[:, :2])
     assert crossing.is_valid
     assert crossing.intersection(shapely.Polygon(EXAMPLE.elements[0].points)).area > 0.7 * 41.0
+
+
+def test_py123d_opens_the_map(tmp_path):
+    python = python_with("py123d", tmp_path, *PY123D)
+    write_map(EXAMPLE, tmp_path / "map.arrow", PLANE)
+    seen = printed_json(python, HERE / "open_with_py123d.py", tmp_path / "map.arrow")
+    assert seen["layers"] == ["CROSSWALK", "ROAD_EDGE", "ROAD_LINE"]
+    assert (seen["location"], seen["has_z"]) == ("scene-0103", False)
+    np.testing.assert_allclose(seen["ROAD_LINE"], [np.column_stack([LINE, [50.0, 51.0, 53.0]])])
+    np.testing.assert_allclose(seen["ROAD_EDGE"], [[[0, 15, 0], [20, 15, 0]]])
+    np.testing.assert_allclose(np.array(seen["outline"])[:, :2], EXAMPLE.elements[0].points)
+    assert seen["area"] == pytest.approx(41.0)
 
 
 def test_readers_and_the_checker_of_opendrive_accept_the_map(tmp_path):
