@@ -9,9 +9,7 @@ import torch
 
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.streams import FeatureStore
@@ -62,9 +60,7 @@ def fill_features(
         for start in range(0, frames := len(scenes.scenes[scene]), ENCODE_BATCH):
             numbers = range(start, min(start + ENCODE_BATCH, frames))
             loaded = [scenes.load(scene, frame, store.mirrored(scene)) for frame in numbers]
-            batch = collate_frames(loaded, config).to(network.device)
-            images = normalise_images(batch.images, config.image)
-            inputs = FrameInputs(images, batch.camera_valid, batch.ego_to_global, batch.calibration)
+            inputs = collate_frames(loaded, config).inputs(network)
             features.append(network.encode_bev(network.encode_images(inputs), inputs))
         store.write(scene, features)
         if rank == 0 and done % 10 == 0:

@@ -19,7 +19,6 @@ from torch.utils.checkpoint import checkpoint
 from mapfusion.elements import ElementKind
 from predmapnet.config import BevFormerConfig
 from predmapnet.network.ego_motion import relative_motion, relative_pose
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
 from predmapnet.network.predmapnet import PredMapNet
@@ -103,7 +102,7 @@ class StageTraining(nn.Module):
         targets = [instant.targets for instant in segment.instants] + following
         truths = [Truth(each, network.device, self._unit) for each in targets]
         for number, (instant, truth) in enumerate(zip(segment.instants, truths, strict=False)):
-            inputs = self._inputs(instant)
+            inputs = instant.inputs(network)
             seen = self._as_seen(past.state, inputs, step, noise) if number else past.state
             if segment.features:
                 bev = BevFeatures([level.to(network.device) for level in segment.features[number].levels])
@@ -153,14 +152,6 @@ class StageTraining(nn.Module):
             return past
         forgetful = torch.tensor([each.random() < self.stage.tracks.state_dropout for each in draws])
         return Past(forget(past.state, (segment.fresh | forgetful).to(self.network.device)), past.owners)
-
-    def _inputs(self, instant: Batch) -> FrameInputs:
-        """Turn stored frames into what the network takes."""
-        device, images = self.network.device, instant.images.to(self.network.device)
-        if images.dtype == torch.uint8 and images.numel():
-            images = normalise_images(images, self.network.config.image)
-        valid, poses = instant.camera_valid.to(device), instant.ego_to_global.to(device)
-        return FrameInputs(images, valid, poses, instant.calibration.to(device))
 
     def _encode(
         self, inputs: FrameInputs, seen: StreamState | None, instant: Batch, trained: bool, sums: LossSums

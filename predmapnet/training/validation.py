@@ -12,11 +12,10 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, threshol
 from predmapnet.evaluation.consistency_ap import consistency_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.mapper import to_frame_map
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
-from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
+from predmapnet.training.data.batches import collate_frames
+from predmapnet.training.data.scene_cache import CachedScene
 
 EVERY = 4
 """Every fourth frame is measured: neighbours look alike."""
@@ -86,7 +85,7 @@ def map_frames(network: PredMapNet, scene: CachedScene, indices: Iterable[int], 
     known, geometry = b"", None
     for index in indices:
         frame = scene.frame(index)
-        inputs = _inputs(frame, network)
+        inputs = collate_frames([frame], config).inputs(network)
         if (cameras := frame.calibration.fingerprint()) != known:
             known, geometry = cameras, network.view_geometry(inputs.calibration)
         outputs = network(inputs, state, geometry)
@@ -95,13 +94,3 @@ def map_frames(network: PredMapNet, scene: CachedScene, indices: Iterable[int], 
         pose = inputs.ego_to_global[0].cpu().numpy()
         yield to_frame_map(selection, after, outputs.segmentation, config, index * FRAME_INTERVAL_NS, pose)
         state = after if streaming else empty
-
-
-def _inputs(frame: CachedFrame, network: PredMapNet) -> FrameInputs:
-    device = network.device
-    return FrameInputs(
-        images=normalise_images(torch.from_numpy(frame.images)[None].to(device), network.config.image),
-        camera_valid=torch.from_numpy(frame.camera_valid)[None].to(device),
-        ego_to_global=torch.from_numpy(frame.ego_to_global)[None].to(device),
-        calibration=frame.calibration.to(device),
-    )

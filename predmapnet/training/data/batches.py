@@ -11,7 +11,9 @@ from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.network.calibration import Calibration, collate_calibrations, pad_cameras
-from predmapnet.network.state import BevFeatures
+from predmapnet.network.image_input import normalise_images
+from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import BevFeatures, FrameInputs
 from predmapnet.training.data.scene_cache import CachedFrame
 from predmapnet.training.data.targets import Targets, truth_targets
 
@@ -39,9 +41,13 @@ class Batch:
     targets: Targets
     depth: Tensor | None = None
 
-    def to(self, device: torch.device) -> Batch:
-        """Move every tensor to ``device``."""
-        return Batch(**{name: value.to(device) for name, value in vars(self).items() if value is not None})
+    def inputs(self, network: PredMapNet) -> FrameInputs:
+        """Return what a network takes of these frames, on its device."""
+        device, images = network.device, self.images.to(network.device)
+        if images.dtype == torch.uint8 and images.numel():
+            images = normalise_images(images, network.config.image)
+        valid, poses = self.camera_valid.to(device), self.ego_to_global.to(device)
+        return FrameInputs(images, valid, poses, self.calibration.to(device))
 
 
 @dataclass

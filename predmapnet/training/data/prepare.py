@@ -94,7 +94,7 @@ def parse_data_sets(names: Sequence[str], roots: Sequence[Path] = ()) -> tuple[D
 
 
 def prepare_data(
-    options: DataOptions, config: PredMapNetConfig, processes: int, report: Report = print, fill: bool = True
+    options: DataOptions, config: PredMapNetConfig, processes: int, report: Report = print
 ) -> tuple[TrainingScenes, list[CachedScene]]:
     """Bring all scenes of a run into the cache.
 
@@ -103,7 +103,6 @@ def prepare_data(
         config: of the network that is going to be trained.
         processes: how many work side by side.
         report: gets lines for the user.
-        fill: False for processes that come after one that filled the cache.
 
     Returns:
         The scenes to train on, and those to validate on.
@@ -114,7 +113,7 @@ def prepare_data(
     train: dict[Path, float] = {}
     validation: list[Path] = []
     for chosen in options.sets:
-        folder, learned, measured = _prepare(chosen, options, config, processes, report, fill)
+        folder, learned, measured = _prepare(chosen, options, config, processes, report)
         train |= {folder / name: chosen.weight for name in learned if (folder / name / INDEX).exists()}
         validation += [folder / name for name in measured if (folder / name / INDEX).exists()]
     if not train:
@@ -124,22 +123,20 @@ def prepare_data(
 
 
 def _prepare(
-    chosen: DataSet, options: DataOptions, config: PredMapNetConfig, processes: int, report: Report, fill: bool
+    chosen: DataSet, options: DataOptions, config: PredMapNetConfig, processes: int, report: Report
 ) -> tuple[Path, list[str], list[str]]:
     """Fill the cache of one data set; return its folder, and names of training and validation scenes."""
     if chosen.name == DEMO:
         folder = cache_folder(options.cache, f"{DEMO}-v{WORLD_VERSION}", config)
         learned, measured = _demo_names("train", options.towns), _demo_names("val", options.validation)
-        if fill:
-            fill_with_demo(folder, learned + measured, config, processes, report)
+        fill_with_demo(folder, learned + measured, config, processes, report)
         return folder, learned, measured
     source, sentence = open_source(chosen.name, chosen.root, options.split_scheme)
     place = sha256(str(source.root.resolve()).encode()).hexdigest()[:8]
     folder = cache_folder(options.cache, f"{source.name}-{place}", config)
     learned, measured = _names(source.scenes(), options.validation)
-    if fill:
-        report(f"{sentence} {len(learned)} scenes to train on, {len(measured)} to validate on.")
-        fill_from_source(source, learned + measured, folder, config, processes, report)
+    report(f"{sentence} {len(learned)} scenes to train on, {len(measured)} to validate on.")
+    fill_from_source(source, learned + measured, folder, config, processes, report)
     return folder, learned, measured
 
 

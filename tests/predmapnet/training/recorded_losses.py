@@ -14,9 +14,7 @@ import numpy as np
 import torch
 
 from predmapnet.network.calibration import Calibration, collate_calibrations
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.draws import TrainingScenes
@@ -76,8 +74,7 @@ def segment_of(network: PredMapNet, scenes: TrainingScenes, step: int, fresh: li
     features = []
     network.eval()
     for instant in instants:
-        images = normalise_images(instant.images, network.config.image)
-        inputs = FrameInputs(images, instant.camera_valid, instant.ego_to_global, instant.calibration)
+        inputs = instant.inputs(network)
         features.append(network.encode_bev(network.encode_images(inputs), inputs))
         instant.images, instant.calibration = torch.zeros(STREAMS, 0, 0, 0, 3), Calibration.empty(STREAMS)
         instant.camera_valid = torch.zeros(STREAMS, 0, dtype=torch.bool)

@@ -11,7 +11,16 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate
 from predmapnet.presets import preset
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.augmentation import AugmentationSettings, cover_grid, disturb_pose, drop_camera, mirror
+from predmapnet.training.data.augmentation import (
+    AugmentationSettings,
+    augment,
+    cover_grid,
+    disturb_pose,
+    drop_camera,
+    mirror,
+)
+from predmapnet.training.data.calibration_noise import CalibrationNoise
+from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.data.scene_cache import CachedFrame
 from tests.predmapnet.network.mirrored_rig import mirror_rig
 
@@ -62,6 +71,27 @@ def test_a_mirrored_left_camera_has_the_learned_code_of_the_right_one():
         for name in names
     ]
     assert mirror(drawn_frame(LITE), LITE).calibration.camera_code.tolist() == [[0] * 6]
+
+
+def test_a_frame_is_taken_again_in_all_the_ways_that_are_asked_for():
+    generator = np.random.default_rng(0)
+    frame = replace(drawn_frame(LITE), images=generator.integers(0, 255, (6, 32, 64, 3), dtype=np.uint8))
+    nothing = PhotographySettings(**dict.fromkeys(PhotographySettings.__dataclass_fields__, 0.0))
+    asked = {
+        "images": {"photography": PhotographySettings(exposure=1.5, noise=10.0)},
+        "camera_valid": {"camera_dropout": 1.0},
+        "calibration": {"calibration": CalibrationNoise(probability=1.0)},
+    }
+    exact = AugmentationSettings(photography=nothing, camera_dropout=0.0, calibration=CalibrationNoise(probability=0.0))
+    for changed in (None, *asked):
+        settings = replace(exact, **asked.get(changed, {}))
+        again = augment(frame, settings, LITE.image, generator, bump=1)
+        assert np.array_equal(again.images, frame.images) == (changed != "images")
+        assert again.camera_valid.sum() == frame.camera_valid.sum() - (changed == "camera_valid")
+        matrices = (each.calibration.ego_to_image for each in (again, frame))
+        assert torch.equal(*matrices) == (changed != "calibration")
+    covered = augment(frame, replace(exact, grid_mask=1.0), LITE.image, generator, bump=1)
+    assert not np.array_equal(covered.images, frame.images)
 
 
 def test_what_stands_in_the_world_stands_still_in_the_mirrored_one():

@@ -1,5 +1,6 @@
 """Epochs: everything comes as often as it should, in an order that hangs on nothing but seed and number."""
 
+from collections import Counter
 from itertools import islice, pairwise
 
 import numpy as np
@@ -11,10 +12,12 @@ from hypothesis import strategies as st
 from predmapnet.errors import UserError
 from predmapnet.network.state import BevFeatures
 from predmapnet.training.data.augmentation import AugmentationSettings
-from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, step_loader
+from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, TrainingScenes, step_loader
+from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.data.streams import FeatureStore, Streams
+from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import StreamSettings
-from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
+from tests.predmapnet.training.painted_scenes import painted_scene, painted_scenes, tiny_config
 
 CONFIG = tiny_config()
 
@@ -95,6 +98,100 @@ def test_the_frames_of_a_clip_are_mirrored_together_and_have_one_wrong_calibrati
         # The car drives straight on along x; a mirrored front left camera looks right.
         mirrored.add(tuple(float(frame.calibration.ego_to_image[0, 1, 2, 1]) > 0 for frame in frames))
     assert mirrored == {(True,) * 3, (False,) * 3}
+
+
+def test_weights_of_scenes_and_of_crossings_decide_how_often_a_frame_is_seen(scenes, tmp_path):
+    weighted = TrainingScenes([CachedScene(scene.folder) for scene in scenes.scenes], [1.0, 3.0], CONFIG)
+    for scene in weighted.scenes:
+        scene.with_crossing[::2] = False
+    clips = Clips(weighted, AugmentationSettings(), (0, 1), crossing_weight=2.0)
+    seen = Counter(clips.name(draw) for draw in range(len(clips)))
+    for scene, weight in zip(weighted.scenes, weighted.weights, strict=True):
+        factors = np.array([1.0, 2.0] * 3)
+        assert [seen[f"{scene.name} frame {frame}"] for frame in range(6)] == (weight * factors).tolist()
+    streams = streams_of(weighted, tmp_path, 12)
+    begun = Counter(name.split()[0] for step in range(8) for name in named_fresh(streams, step))
+    assert begun["scene-1"] == pytest.approx(3 * begun["scene-0"], rel=0.4)
+
+
+def streams_of(scenes, folder, count, settings=None, augmentation=None):
+    """Streams whose features tell scene and frame: ten times the one, and the other."""
+    store = FeatureStore(folder, ((1, 2, 2),), scenes.scenes)
+    for number, scene in enumerate(scenes.scenes):
+        rows = torch.arange(float(len(scene)))[:, None, None, None] + 10 * number
+        store.write(number, [BevFeatures([rows.expand(len(scene), 1, 2, 2)])])
+    exact = AugmentationSettings(pose_metres=0.0, pose_degrees=0.0)
+    settings = settings or StreamSettings(streams=count, frames=2, longest=6, growth_steps=1)
+    return Streams(scenes, store, settings, augmentation or exact, (0, 2))
+
+
+def named_fresh(streams, step):
+    """Names of the frames with which streams begin at a step."""
+    fresh = streams[step].fresh.tolist()
+    return [name for name, new in zip(streams.name(step).split(", "), fresh, strict=True) if new]
+
+
+def test_clips_are_in_the_order_of_time_and_reach_as_far_back_as_asked_for(scenes):
+    clips = Clips(scenes, AugmentationSettings(pose_metres=0.0), (3, 1), frames=3, span=5)
+    steps = set()
+    for draw in range(40):
+        places = [frame.ego_to_global[0, 3] for frame in clips[draw]]
+        assert places == sorted(places)
+        steps |= set((np.diff(places) / 3.0).round().astype(int).tolist())
+    assert {1, 2, 3} <= steps
+
+
+def test_a_frame_is_seen_in_other_light_in_the_next_epoch(scenes):
+    clips = Clips(scenes, AugmentationSettings(mirror=0.0), (3, 1))
+    names = {clips.name(draw): draw for draw in range(len(clips), 2 * len(clips))}
+    for draw in range(3):
+        once, again = clips[draw][0], clips[names[clips.name(draw)]][0]
+        assert (once.ego_to_global == again.ego_to_global).all() and not (once.images == again.images).all()
+
+
+def test_streams_see_the_truth_of_their_frame_of_their_hand_and_of_the_frame_that_comes(scenes, tmp_path):
+    streams = streams_of(scenes, tmp_path, 2)
+    known = 0
+    for step in range(12):
+        segment, following = streams[step], streams[step + 1]
+        for stream in range(2):
+            code = int(segment.features[-1].levels[0][stream, 0, 0, 0])
+            scene, frame = divmod(code, 10)
+            seen = segment.instants[-1].targets
+            expected = targets_of(scenes, scene, frame)
+            assert torch.equal(seen.points[seen.frame == stream], expected.points)
+            after = segment.after.points[segment.after.frame == stream]
+            assert len(after) or following.fresh[stream]
+            known += len(after) > 0
+            assert not len(after) or torch.equal(after, targets_of(scenes, scene, frame + 1).points)
+    assert 1 < known < 24
+
+
+def targets_of(scenes, scene, frame):
+    """Truth of a frame as it is stored: scenes of odd numbers mirrored."""
+    loaded = scenes.load(scene, frame, FeatureStore.mirrored(scene), images=False)
+    return truth_targets([loaded.truth], CONFIG.roi, CONFIG.decoder.points, None)
+
+
+def test_poses_of_streams_are_as_wrong_as_asked_for(scenes, tmp_path):
+    noisy = AugmentationSettings(pose_metres=0.5, pose_degrees=0.0)
+    exact, wrong = streams_of(scenes, tmp_path, 12), streams_of(scenes, tmp_path, 12, augmentation=noisy)
+    places = [
+        torch.cat([instant.ego_to_global[:, :2, 3] for step in range(4) for instant in streams[step].instants])
+        for streams in (exact, wrong)
+    ]
+    assert 0.35 < float((places[1] - places[0]).std()) < 0.65
+
+
+def test_drives_begin_anywhere_have_any_length_and_scenes_that_are_too_short_are_left_out(scenes, tmp_path):
+    short = painted_scene(tmp_path / "short", 2, 9, CONFIG)
+    mixed = TrainingScenes([short, *scenes.scenes], [1.0] * 3, CONFIG)
+    streams = streams_of(mixed, tmp_path / "run", 2, StreamSettings(2, 3, 6, 1))
+    names = {name for step in range(30) for name in named_fresh(streams, step)}
+    assert not any(name.startswith("short") for name in names)
+    assert len({name.split()[2] for name in names}) > 2
+    fresh = np.array([streams[step].fresh.tolist() for step in range(30)])
+    assert 0.3 < fresh.mean() < 1.0
 
 
 def test_streams_go_on_from_step_to_step_and_can_begin_at_any(scenes, tmp_path):

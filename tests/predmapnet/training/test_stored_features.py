@@ -8,9 +8,7 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.prepare import DataOptions, DataSet
@@ -42,9 +40,7 @@ def some_network(seed=0, config=CONFIG):
 
 @torch.no_grad()
 def encoded(network, scenes, scene, frame, mirrored):
-    batch = collate_frames([scenes.load(scene, frame, mirrored)], network.config)
-    images = normalise_images(batch.images, network.config.image)
-    inputs = FrameInputs(images, batch.camera_valid, batch.ego_to_global, batch.calibration)
+    inputs = collate_frames([scenes.load(scene, frame, mirrored)], network.config).inputs(network)
     return network.encode_bev(network.encode_images(inputs), inputs)
 
 

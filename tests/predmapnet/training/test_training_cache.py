@@ -13,15 +13,18 @@ import numpy as np
 import pytest
 
 from predmapnet.datasets.nuscenes import NuScenesSource
+from predmapnet.datasets.splits import split_names
 from predmapnet.demo_world.rigs import sample_rig
 from predmapnet.errors import UserError
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import stack_windows
 from predmapnet.presets import preset
+from predmapnet.scenes import SceneInfo
 from predmapnet.training.data.fill_cache import expected_bytes
 from predmapnet.training.data.prepare import (
     DataOptions,
     DataSet,
+    _names,
     cache_folder,
     count_frames,
     parse_data_sets,
@@ -189,6 +192,26 @@ def test_other_roots_sizes_and_regions_have_caches_of_their_own(town, tmp_path):
     paper = DataOptions((DataSet("nuscenes", town.with_name("moved")),), tmp_path / "cache")
     wider = CONFIG.model_copy(update={"roi_width": 50.0})
     assert prepare_data(paper, wider, 1)[0].scenes[0].folder not in (first, second)
+
+
+def test_truth_is_cut_to_the_region_of_the_network(town, tmp_path):
+    smaller = CONFIG.model_copy(update={"roi_length": 20.0, "roi_width": 16.0})
+    scenes, _ = prepare_data(DataOptions((DataSet("nuscenes", town),), tmp_path / "cache"), smaller, 1)
+    whole = prepared(town, tmp_path / "cache")[0].scenes[0].frame(0).truth
+    cut, expected = scenes.scenes[0].frame(0).truth, NuScenesSource(town).open("scene-0061").truth(0, smaller.roi)
+    assert [line.tolist() for line in cut.polylines] == [line.tolist() for line in expected.polylines]
+    assert [line.tolist() for line in cut.polylines] != [line.tolist() for line in whole.polylines]
+
+
+def test_weights_of_data_sets_are_those_of_their_scenes(town, tmp_path):
+    scenes, _ = prepare_data(DataOptions((DataSet("nuscenes", town, 2.5),), tmp_path / "cache"), CONFIG, 1)
+    assert scenes.weights == [2.5]
+
+
+def test_logs_that_published_training_leaves_out_are_left_out():
+    left_out = split_names("argoverse2_skipped")[0]
+    infos = [SceneInfo(name, "train", 3, "PIT") for name in (left_out, "another")]
+    assert _names(infos, 10) == (["another"], [])
 
 
 def test_codes_of_cameras_have_caches_of_their_own_and_other_networks_share_one():
