@@ -231,8 +231,8 @@ def _rejected(report: dict[str, dict[str, int]]) -> list[str]:
 
 
 def _links(outcome: Outcome, names: set[str], links: str) -> str:
-    stem = file_name(outcome.scene)
+    stems = dict.fromkeys((file_name(outcome.scene), outcome.scene))  # of maps that batch did not make, their own name
     kinds = {".rrd": "recording", ".parquet": "frames", ".summary.json": "record", ".failed.json": "record"}
     kinds = {ending: "map" for ending in SUFFIXES if ending != ".json"} | kinds
-    found = [(stem + ending, text) for ending, text in kinds.items() if stem + ending in names]
+    found = [(stem + ending, text) for stem in stems for ending, text in kinds.items() if stem + ending in names]
     return " ".join(link(links + quote(name), text) for name, text in found)

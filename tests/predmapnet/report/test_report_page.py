@@ -19,7 +19,7 @@ from mapfusion.formats.by_suffix import write_map
 from mapfusion.formats.local_plane import LocalPlane
 from predmapnet.errors import UserError
 from predmapnet.report.doubts import doubtful_stretches
-from predmapnet.report.drawn_map import STEP, DrawnElement, packed, varints
+from predmapnet.report.drawn_map import STEP, TRUTH, UNKNOWN, DrawnElement, packed, varints
 from predmapnet.report.page import ROWS_AT_ONCE, Cell, Column, sortable_table
 from predmapnet.report.places import lay_out
 from predmapnet.runs.batch_records import Outcome, write_done, write_failed
@@ -58,13 +58,14 @@ def test_varints_give_the_numbers_back(numbers):
 
 def test_packed_elements_lie_where_they_are_to_half_a_step():
     elements = [line(3.0), line(-7.03, ElementKind.BOUNDARY, deviation=None)]
-    drawn = [DrawnElement(element, np.array([1000.0, -500.0]), row) for row, element in enumerate(elements)]
+    drawn = [DrawnElement(element, np.array([1000.0, -500.0]), row, row == 1) for row, element in enumerate(elements)]
     found = packed(drawn)
     content = zlib.decompress(base64.b64decode(str(found["packed"])))
     rows, counts = np.frombuffer(content, "<u4", 4).reshape(2, 2)
     assert rows.tolist() == [0, 1]
     assert counts.sum() == found["points"]
-    assert content[20:22] == bytes([1, 2])  # kinds, after two rows, counts and observations
+    assert content[20:22] == bytes([1, 2 + TRUTH])  # kinds, after two rows, counts and observations
+    assert content[22:26] == bytes([242, 242, 10, UNKNOWN])  # confidences 0.95, deviation 0.2 m and none
     steps = np.array(decoded(content[26:], 2 * int(counts.sum()))).reshape(-1, 2)
     points = np.cumsum(steps, axis=0) * STEP
     for element, part in zip(elements, np.split(points, np.cumsum(counts)[:-1]), strict=True):
@@ -128,6 +129,40 @@ def test_the_page_needs_nothing_from_elsewhere_and_names_every_failure(folder):
     assert data["elements"] == 1
     assert data["rows"] == ["scene-1"]
     assert 'href="/' in folder_report(folder, out_beside=False)
+
+
+def row_of(html: str, scene: str) -> dict[str, str]:
+    """Texts of the row of a scene by heading."""
+    table = html[html.index("<h2>Scenes") :]
+    heads = re.findall(r"<th [^>]*>([^<]*)</th>", table)
+    row = next(line for line in table.split("<tr") if f">{scene}</td>" in line)
+    cells = [re.sub(r"<[^>]+>", "", cell) for cell in re.findall(r"<td [^>]*>(.*?)</td>", row)]
+    return dict(zip(heads, cells, strict=True))
+
+
+def test_every_figure_of_a_scene_stands_under_its_heading(folder, tmp_path):
+    doubtful = line(30.0, confidence=0.5, observations=2)
+    write_map(GlobalMap((line(), doubtful)), tmp_path / "scene-1.geojson", PLANE)
+    write_failed(folder, Outcome("scene-1", "failed", 1.0, error="KeyError", reason="an earlier time"))
+    html = folder_report(folder)
+    figures = {"frames": "40", "frames/s": "5.0", "elements": "2", "km": "0.20", "doubts": "1", "rejected": "2"}
+    figures |= {"mAP": "0.625", "precision": "0.900", "recall": "0.700", "why": "rejected 2 x jump", "status": "done"}
+    assert row_of(html, "scene-1").items() >= figures.items()
+    failed = row_of(html, "&lt;/script&gt;&lt;i&gt;")
+    assert (failed["status"], failed["elements"], failed["frames"]) == ("failed", "–", "–")
+    tiles = dict(re.findall(r"<b>([^<]*)</b><span>([^<]*)</span>", html))
+    assert tiles["1"] in ("scenes mapped", "scenes failed", "doubtful stretches")
+    assert tiles["40"] == "frames, 5.0/s per worker"
+    assert tiles["0.2 km"] == "dividers"
+
+
+def test_names_and_places_of_any_letters_break_neither_links_nor_the_script(tmp_path):
+    write_map(GlobalMap((line(),)), tmp_path / "a b#1%.geojson", PLANE, {"location": "</script><b>"})
+    html = folder_report(OutputFolder(str(tmp_path)))
+    assert 'href="a%20b%231%25.geojson"' in html
+    data = json.loads(re.search(r'id="city-data">(.*?)</script>', html, re.DOTALL)[1])
+    assert data["places"][0]["name"] == "</script><b>"
+    assert "</script><b>" not in html
 
 
 def test_the_map_is_drawn_before_long_tables_are_laid_out_and_no_row_is_lost(folder):
