@@ -59,6 +59,11 @@ def test_the_dead_and_the_stuck_are_replaced_and_their_tasks_tried_again_elsewhe
     assert not any(alive(process) for task in tasks for process in notes.tries(task))
 
 
+def test_what_is_tried_again_waits_for_all_that_were_not_tried(tmp_path):
+    tasks = ["die once", *(f"square {number}" for number in range(4))]
+    assert [end.task for end in ProcessExecutor(1).run(Notebook(tmp_path), tasks)] == [*tasks[1:], tasks[0]]
+
+
 def test_workers_that_cannot_begin_end_the_run_with_their_error():
     with pytest.raises(UserError, match="no weights"):
         list(ProcessExecutor(2).run(Unfit(), ["square 1", "square 2", "square 3"]))
