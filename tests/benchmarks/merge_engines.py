@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.merge_engines [--drives 1000] [--rounds 1]
 
-Wall times say little on a machine that does other things, too: what counts are CPU seconds, and the share of the time in
-which workers had something to do.
+Wall times say little on a machine that does other things, too: what counts are CPU seconds, and the share of the time
+in which workers had something to do.
 """
 
 from __future__ import annotations
