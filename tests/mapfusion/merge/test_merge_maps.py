@@ -13,7 +13,7 @@ from mapfusion.alignment import align, landmarks, move
 from mapfusion.formats.by_suffix import read_map, write_map
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import arc_length
-from mapfusion.ground import RIM, coverage, near_elements, observed_rings
+from mapfusion.ground import RIM, coverage, ground_within, near_elements, observed_rings
 from mapfusion.merge.config import MergeConfig
 from mapfusion.merge.contribution import Looks, certainty
 from mapfusion.merge.merge import merge_files, merge_maps
@@ -132,6 +132,23 @@ def test_merging_drives_takes_out_their_offsets_and_half_their_noise():
     assert all(1 < len(e.sources) <= 8 for e in merged)
 
 
+def test_a_map_that_contradicts_the_others_is_kept_as_it_is_and_said():
+    x = np.linspace(0, 200, 201)
+    corner = line([[0, 40], [60, 40], [60, 90]], BOUNDARY)
+    road = GlobalMap((*(line(np.stack([x, np.full(201, y)], axis=1), BOUNDARY) for y in (-7.3, 6.1)), corner))
+    again = GlobalMap(tuple(replace(e, points=e.points + 0.2) for e in road))
+    waves = (3 * np.sin(x / 9 + phase) + y for phase, y in ((1.0, -7.0), (4.0, 0.0), (2.0, 7.0)))
+    other = GlobalMap(tuple(line(np.stack([x, wave], axis=1), BOUNDARY) for wave in waves))
+    merged, report = merge_maps([road, again, other], ["road", "again", "other"])
+    assert [status.name for status in report.maps if status.apart] == ["other"]
+    kept = [element for element in merged if element.sources == ("other",)]
+    assert [e.points.tobytes() for e in kept] == [e.points.tobytes() for e in other]
+    assert sum(e.length for e in merged) - sum(e.length for e in kept) == pytest.approx(
+        sum(e.length for e in road), rel=0.02
+    )
+    assert report.elements["boundary"] == len(merged)
+
+
 def test_the_order_of_the_maps_does_not_matter():
     rng = np.random.default_rng(6)
     truth = town(1)
@@ -218,6 +235,23 @@ def test_files_merge_with_provenance_and_a_copy_counts_once(tmp_path):
     assert coverage(city, plane).symmetric_difference(ground).area < 0.1 * ground.area
     expected, _ = merge_maps(maps)
     assert city.length(BOUNDARY) == pytest.approx(expected.length(BOUNDARY), rel=0.01)
+
+
+def test_the_merged_map_has_observed_what_any_drive_has_if_all_say_so(tmp_path):
+    plane = LocalPlane(8.4, 49.0)
+    grounds = [shapely.box(-20.0, -20.0, 80.0, 20.0), shapely.box(60.0, -20.0, 160.0, 30.0)]
+    for number, ground in enumerate(grounds):
+        kerb = line([[60.0 * number, 0.0], [60.0 * number + 70.0, 0.0]], BOUNDARY)
+        told = {"observed": observed_rings(ground, plane)}
+        write_map(GlobalMap((kerb,)), tmp_path / f"{number}.geojson", plane, told)
+    write_map(GlobalMap((line([[0.0, 0.0], [50.0, 0.0]], BOUNDARY),)), tmp_path / "silent.geojson", plane)
+    paths = [tmp_path / "0.geojson", tmp_path / "1.geojson"]
+    merge_files(paths, tmp_path / "both.geojson")
+    rings = read_map(tmp_path / "both.geojson", plane).provenance["observed"]
+    together = ground_within([plane.from_wgs84(np.array(ring)) for ring in rings])
+    assert together.symmetric_difference(shapely.union_all(grounds)).area < 5.0
+    merge_files([*paths, tmp_path / "silent.geojson"], tmp_path / "all.geojson")
+    assert "observed" not in read_map(tmp_path / "all.geojson", plane).provenance
 
 
 def test_names_tell_files_apart(tmp_path):

@@ -12,7 +12,7 @@ from mapfusion.executors import Sequential, results_in_order
 from predmapnet.errors import UserError
 from predmapnet.runs.process_executor import ProcessExecutor
 from predmapnet.runs.supervision import ATTEMPTS, TimeLimitError, WorkerDiedError
-from tests.predmapnet.runs.work import Notebook, Unfit
+from tests.predmapnet.runs.work import Notebook, Stillborn, Unfit
 
 
 def alive(process: str) -> bool:
@@ -67,6 +67,10 @@ def test_what_is_tried_again_waits_for_all_that_were_not_tried(tmp_path):
 def test_workers_that_cannot_begin_end_the_run_with_their_error():
     with pytest.raises(UserError, match="no weights"):
         list(ProcessExecutor(2).run(Unfit(), ["square 1", "square 2", "square 3"]))
+
+
+def test_a_worker_that_dies_while_it_begins_is_replaced(tmp_path):
+    assert [end.result for end in ProcessExecutor(1).run(Stillborn(tmp_path), ["a", "b"])] == ["A", "B"]
 
 
 def test_tasks_are_taken_as_workers_become_free_and_workers_end_with_the_run(tmp_path):

@@ -51,3 +51,17 @@ class Unfit:
     def __call__(self) -> Callable[[str], None]:
         """Refuse to begin."""
         raise UserError("there are no weights here")
+
+
+@dataclass(frozen=True)
+class Stillborn:
+    """Work whose first worker dies while it begins, by a folder that remembers."""
+
+    folder: Path
+
+    def __call__(self) -> Callable[[str], str]:
+        """Die, or begin."""
+        if not (self.folder / "died").exists():
+            (self.folder / "died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return str.upper
