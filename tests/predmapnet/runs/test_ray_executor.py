@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from predmapnet.errors import UserError
 from predmapnet.runs.ray_executor import RayExecutor
 from predmapnet.runs.supervision import ATTEMPTS, TimeLimitError, WorkerDiedError
-from tests.predmapnet.runs.work import Notebook, Unfit
+from tests.predmapnet.runs.work import Niceness, Notebook, Unfit
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,11 @@ def test_tasks_end_once_and_the_dead_and_the_stuck_are_replaced(executor, said, 
 def test_actors_that_cannot_begin_end_the_run_with_their_error(executor):
     with pytest.raises(UserError, match="no weights"):
         list(executor.run(Unfit(), ["square 1", "square 2"]))
+
+
+def test_actors_do_not_give_way_to_what_else_runs_here(executor):
+    (end,) = executor.run(Niceness(), ["task"])
+    assert end.result == os.nice(0)
 
 
 def test_without_the_extra_or_the_cluster_the_message_says_what_to_do(monkeypatch):
