@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate, collate_calibrations
 from predmapnet.network.image_input import crop_image, image_window
 from predmapnet.network.layers import cell_centres
 from predmapnet.network.small.backbone import STRIDE
-from predmapnet.network.small.ground_lookup import find_on_ground, ground_points, to_ground
+from predmapnet.network.small.ground_lookup import SparseRows, find_on_ground, ground_points, row_starts, to_ground
 from predmapnet.presets import preset
 from tests.predmapnet.network.mirrored_rig import mirror_rig
 
@@ -127,3 +129,18 @@ def test_the_window_follows_the_horizon_of_a_pitched_camera_and_stays_in_the_ima
     window = image_window(replace(level, height=200), CONFIG.image)
     assert window.top == 0
     assert crop_image(np.full((200, 800, 3), 9, np.uint8), replace(level, height=200), CONFIG.image)[-1].max() == 0
+
+
+@given(seed=st.integers(0, 10_000), rows=st.integers(1, 6), columns=st.integers(1, 7), entries=st.integers(0, 12))
+@settings(max_examples=40, deadline=None)
+def test_a_transposed_matrix_is_the_transpose_on_a_cpu_and_elsewhere(seed, rows, columns, entries):
+    """Empty rows and columns included; an entry may come twice, as at the border of an image."""
+    generator = torch.Generator().manual_seed(seed)
+    row = torch.randint(rows, (entries,), generator=generator).sort().values
+    column = torch.randint(columns, (entries,), generator=generator).int()
+    weights = torch.rand(entries, generator=generator)
+    matrix = SparseRows(column, row_starts(torch.bincount(row, minlength=rows)), weights)
+    dense = torch.zeros(rows, columns).index_put((row, column.long()), weights, accumulate=True)
+    table = torch.rand(rows, 3, generator=generator)
+    for turned in (matrix.transposed(columns), matrix._transposed_by_sorting(columns)):
+        torch.testing.assert_close(turned.multiply(table), dense.T @ table)
