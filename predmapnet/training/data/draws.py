@@ -174,6 +174,8 @@ def step_loader(
         batch_sampler=draws,
         collate_fn=clips.collate,
         num_workers=workers,
+        # A forked one may wait for ever for what a thread of its parent (TensorBoard, torch) held just then.
+        multiprocessing_context="spawn" if workers else None,
         worker_init_fn=begin_loading,
         generator=torch.Generator(),
     )
