@@ -147,6 +147,9 @@ def test_a_frame_is_seen_in_other_light_in_the_next_epoch(scenes):
     for draw in range(3):
         once, again = clips[draw][0], clips[names[clips.name(draw)]][0]
         assert (once.ego_to_global == again.ego_to_global).all() and not (once.images == again.images).all()
+    clips = Clips(scenes, AugmentationSettings(), (3, 1))
+    hands = [float(clips[draw][0].calibration.ego_to_image[0, 1, 2, 1]) > 0 for draw in range(2 * len(clips))]
+    assert hands[: len(clips)] != hands[len(clips) :], "places in the order have nothing to do with it"
 
 
 def test_streams_see_the_truth_of_their_frame_of_their_hand_and_of_the_frame_that_comes(scenes, tmp_path):
