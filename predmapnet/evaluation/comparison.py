@@ -24,7 +24,7 @@ CONFIDENCE = 0.95
 FEW_SCENES = 10
 """Below this number of scenes, intervals are too narrow to be trusted."""
 
-_POOLED = {
+POOLED = {
     "chamfer_mAP": ("chamfer_ap", "mAP"),
     "ahead_mAP": ("ahead_ap", "mAP"),
     "rear_mAP": ("rear_ap", "mAP"),
@@ -122,8 +122,8 @@ def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
     """
     if len(paths) < 2:
         raise UserError("A comparison needs at least two files of 'predmapnet evaluate --json'.")
-    names = [path.absolute() for path in paths]
-    twice = next((path for path in paths if names.count(path.absolute()) > 1), None)
+    names = [path.resolve() for path in paths]
+    twice = next((path for path in paths if names.count(path.resolve()) > 1), None)
     if twice is not None:
         raise UserError(f"{twice} is given twice.")
     evaluations = [_read(path) for path in paths]
@@ -213,7 +213,7 @@ def _value(content: Mapping[str, Any], scene: str, name: str) -> float:
 
 
 def _pooled(content: Mapping[str, Any], name: str) -> float | None:
-    section, key = _POOLED[name]
+    section, key = POOLED[name]
     value = (content.get(section) or {}).get(key)
     return None if value is None else float(value)
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, frame_matches
-from predmapnet.evaluation.chamfer_distance import chamfer_matrix, resample_all
+from mapfusion.elements import RegionOfInterest
+from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, frame_matches, thresholds_for
+from predmapnet.evaluation.chamfer_distance import chamfer_matrix, match_greedily, resample_all
 from predmapnet.evaluation.frames import simplify_all
 from predmapnet.evaluation.precision_recall import accumulate
 
@@ -53,3 +54,14 @@ def test_distances_are_the_official_ones(case):
         near = expected <= 1.5
         limited = chamfer_matrix(predicted, kinds[:n], true, kinds[:m], limit=1.5)
         np.testing.assert_allclose(limited[near], expected[near], atol=1e-6)
+
+
+def test_a_distance_of_exactly_the_threshold_is_a_match():
+    distances = np.array([[0.5], [np.nextafter(1.0, 2.0)]])
+    assert match_greedily(distances, np.array([0.9, 0.8]), (0.5, 1.0)).tolist() == [[0, 0], [-1, -1]]
+    assert match_greedily(distances[1:], np.array([0.8]), (1.0, 1.5)).tolist() == [[-1, 0]]
+
+
+def test_the_region_decides_the_thresholds():
+    assert thresholds_for(RegionOfInterest(60.0, 30.0)) == (0.5, 1.0, 1.5)
+    assert thresholds_for(RegionOfInterest(100.0, 50.0)) == (1.0, 1.5, 2.0)

@@ -29,6 +29,12 @@ def evaluation(values, **changes):
     return {"evaluated": {**EVALUATED, **changes}, "chamfer_ap": {"mAP": 0.5}, "per_scene": scenes}
 
 
+def with_frames(content, count):
+    """The evaluation with another number of frames in its last scene."""
+    content["per_scene"]["scene-0002"]["frames"] = count
+    return content
+
+
 @pytest.fixture
 def write(tmp_path):
     def files(**evaluations):
@@ -89,6 +95,9 @@ def test_few_scenes_are_named(write):
         (evaluation([0.5] * 3, dataset="nuscenes"), "differ in the data set"),
         (evaluation([0.5] * 3, roi_m=[100.0, 50.0]), "differ in the region"),
         (evaluation([0.5] * 3, split_scheme="new"), "differ in the split scheme"),
+        (evaluation([0.5] * 3, official_frames=True), "differ in the choice of frames"),
+        (evaluation([0.5] * 3, split="val"), "differ in the split"),
+        (with_frames(evaluation([0.5] * 3), 39), "different numbers of frames in scene-0002"),
         (evaluation([0.5] * 4), "scene-0003 only in"),
         ({"evaluated": EVALUATED, "chamfer_ap": {"mAP": 0.5}}, r"no figures of single scenes .*0\.1\.0"),
         ({"mAP": 0.5}, "is no evaluation"),
@@ -106,6 +115,7 @@ def test_one_file_broken_files_and_the_same_file_are_refused(write, tmp_path):
     for paths, message in (
         ([path], "at least two"),
         ([path, path], "given twice"),
+        ([path, path.parent / ".." / path.parent.name / path.name], "given twice"),
         ([path, tmp_path / "absent.json"], "There is no file"),
         ([path, tmp_path / "broken.json"], "not valid JSON"),
     ):

@@ -10,8 +10,14 @@ import pytest
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.geometry import transform_points
 from predmapnet.errors import UserError
+from predmapnet.evaluation.ahead_rear_ap import Half, half_matches
+from predmapnet.evaluation.chamfer_ap import chamfer_average_precision
+from predmapnet.evaluation.comparison import POOLED
+from predmapnet.evaluation.consistency_ap import consistency_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import measure_scene, pool_scenes
+from predmapnet.evaluation.precision_recall import accumulate
+from predmapnet.evaluation.raster_ap import raster_average_precision
 from predmapnet.evaluation.report import write_figures, write_report
 from predmapnet.evaluation.scene_figures import SCENE_FIGURES, scene_figures
 from predmapnet.scenes import FrameTruth
@@ -66,6 +72,32 @@ def test_perfect_predictions_are_perfect_by_every_measure():
     assert figures["tracks"]["id_switches"] == 0
     assert figures["tracks"]["tracked_share"] == 1.0
     assert figures["frames_per_second"] == pytest.approx(2.0)
+
+
+def test_the_figures_together_are_those_of_each_metric_alone(case):
+    """And those of one scene are those of a data set that holds nothing else, in `compare`, too."""
+    frames = [frame for frame in case.frames if frame.scene == case.frames[0].scene]
+    pose, truth = frames[0].predicted.ego_to_global, frames[0].truth
+    true = [transform_points(pose, line) for line in truth.polylines]
+    found = [transform_points(pose, line + np.array([0.0, 1.2])) for line in truth.polylines]
+    maps = [
+        GlobalMap(
+            tuple(MapElement(ElementKind(k), line, 0.9, 3, 0, 1) for k, line in zip(truth.kinds, lines, strict=True))
+        )
+        for lines in (found, [*true[:-1], true[-1] + 30.0])
+    ]
+    scene = measure_scene(frames, *maps)
+    figures, alone = pool_scenes([scene]).figures(), scene_figures(scene)
+    standard = (0.5, 1.0, 1.5)
+    assert figures["chamfer_ap"] == chamfer_average_precision(frames).figures()
+    for section, half in (("ahead_ap", Half.AHEAD), ("rear_ap", Half.REAR)):
+        matches = [half_matches(frame, half, standard) for frame in frames]
+        assert figures[section] == accumulate(matches, standard).figures()
+    assert figures["raster_ap"] == raster_average_precision(frames).figures()
+    assert figures["consistency_ap"].items() >= consistency_average_precision(frames).figures().items()
+    pooled = {name: figures[section][key] for name, (section, key) in POOLED.items()}
+    assert len(set(pooled.values())) == len(pooled), "figures that are equal would hide that one stands for another"
+    assert {name: alone[name] for name in pooled} == pytest.approx(pooled)
 
 
 def test_ids_that_change_cost_consistency_only():
