@@ -72,6 +72,13 @@ def test_the_interval_is_that_of_the_mean_of_as_many_scenes(write):
     assert entry.scenes.high == pytest.approx(values.mean() + error, abs=0.003)
 
 
+def test_equal_methods_have_equal_intervals_and_no_clear_difference(write):
+    values = np.random.default_rng(4).random(20)
+    one, two = compare_evaluations(write(a=evaluation(values), b=evaluation(values))).figures["chamfer_mAP"]
+    assert one.scenes == two.scenes, "the same scenes are drawn for all methods"
+    assert two.difference.mean == two.difference.low == two.difference.high == 0.0 and not two.clear
+
+
 def test_the_seed_decides_the_draws(write):
     paths = write(a=evaluation([0.1, 0.5, 0.9, 0.3]), b=evaluation([0.2, 0.4, 0.9, 0.1]))
     assert compare_evaluations(paths, 5).content() == compare_evaluations(paths, 5).content()

@@ -11,7 +11,7 @@ from predmapnet.evaluation.chamfer_ap import chamfer_average_precision
 from predmapnet.evaluation.consistency_ap import consistency_average_precision, with_formed_tracks
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import measure_scene, pool_scenes
-from predmapnet.evaluation.raster_ap import raster_average_precision
+from predmapnet.evaluation.raster_ap import raster_average_precision, raster_matches
 from predmapnet.scenes import FrameTruth
 
 HERE, THERE = [[-20.0, 3.0], [20.0, 5.0]], [[-20.0, -9.0], [20.0, -8.0]]
@@ -85,6 +85,12 @@ def test_of_two_identical_truths_one_stays_unfound(metric):
     found = divider_precision(metric, [frame(predictions, [(DIVIDER, HERE)] * 2)])
     # Chamfer matching looks at the nearest truth only, overlap at all that are free.
     assert found == pytest.approx(1.0 if metric is raster_average_precision else 0.5, abs=0.005)
+
+
+def test_of_equal_truths_the_last_free_one_is_taken_by_overlap():
+    """As COCO does: three predictions of one line take the equal truths from the last to the first."""
+    found = raster_matches(frame([(DIVIDER, HERE, score, 1) for score in (0.9, 0.8, 0.7)], [(DIVIDER, HERE)] * 2))
+    assert found[DIVIDER].matches.tolist() == [[1, 0, -1]] * 6
 
 
 @each_metric

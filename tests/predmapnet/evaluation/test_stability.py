@@ -15,7 +15,7 @@ from predmapnet.evaluation.stability_matching import MATCHING_POINTS, matching_c
 from predmapnet.evaluation.stability_protocol import Protocol
 from predmapnet.evaluation.stability_values import heights, localisation_and_shape, presence, stations_of
 from predmapnet.scenes import FrameTruth
-from tests.predmapnet.evaluation.metric_fixtures import REFERENCE, load_metric_case
+from tests.predmapnet.evaluation.metric_fixtures import BUNDLED, REFERENCE, load_metric_case
 
 PUBLISHED = {
     "pkl_all_instances": Protocol.ANCHORED,
@@ -26,17 +26,27 @@ NAMES = {"presence": "presence", "localization": "localisation", "shape": "shape
 KINDS = {kind.label: kind for kind in ElementKind}
 
 
-def read(name):
-    path = REFERENCE / name
-    if not path.exists():
-        pytest.skip(f"there is no {path}: set PREDMAPNET_REFERENCE")
-    return json.loads(path.read_text()) if path.suffix == ".json" else dict(np.load(path, allow_pickle=False))
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(BUNDLED, id="bundled"), pytest.param(REFERENCE, id="reference", marks=pytest.mark.reference)],
+)
+def read(request):
+    """Reader of the files of one folder of fixtures."""
+
+    def content(name):
+        path = request.param / name
+        if not path.exists():
+            pytest.skip(f"there is no {path}: set PREDMAPNET_REFERENCE")
+        return json.loads(path.read_text()) if path.suffix == ".json" else dict(np.load(path, allow_pickle=False))
+
+    content.folder = request.param
+    return content
 
 
 @pytest.fixture(scope="module")
-def reference():
+def reference(read):
     read("expected_stability.json")
-    return load_metric_case(REFERENCE)
+    return load_metric_case(read.folder)
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +81,8 @@ def expected_runs():
                 yield variant, key + source
 
 
-@pytest.mark.reference
 @pytest.mark.parametrize(("variant", "key"), list(expected_runs()))
-def test_every_figure_of_every_subset_is_the_toolbox_one(found, variant, key):
+def test_every_figure_of_every_subset_is_the_toolbox_one(read, found, variant, key):
     expected, protocol = read("expected_stability.json")[variant][key], PUBLISHED[variant]
     scenes, interval = found(protocol, key)
     for subset, figures in expected.items():
@@ -93,9 +102,8 @@ def test_every_figure_of_every_subset_is_the_toolbox_one(found, variant, key):
         assert result.figures()["mAS"] == result.mean
 
 
-@pytest.mark.reference
 @pytest.mark.parametrize(("variant", "key"), list(expected_runs()))
-def test_every_instance_has_the_toolbox_match_and_values(reference, found, variant, key):
+def test_every_instance_has_the_toolbox_match_and_values(read, reference, found, variant, key):
     given, protocol = read("expected_stability_intermediates.npz"), PUBLISHED[variant]
     scenes, interval = found(protocol, key)
     result = stability(scenes, protocol, interval)
@@ -121,8 +129,7 @@ def test_every_instance_has_the_toolbox_match_and_values(reference, found, varia
     np.testing.assert_array_equal(np.array(matched), np.stack(rows, axis=1))
 
 
-@pytest.mark.reference
-def test_other_weights_give_the_toolbox_figures(found):
+def test_other_weights_give_the_toolbox_figures(read, found):
     expected = read("expected_stability.json")["extra_overall"]
     for name, figures in expected.items():
         variant, _, rest = name.partition("__")
@@ -134,8 +141,7 @@ def test_other_weights_give_the_toolbox_figures(found):
         assert result.mean == pytest.approx(figures["mean"]["stability"], abs=1e-6)
 
 
-@pytest.mark.reference
-def test_lines_are_read_and_sampled_as_in_the_toolbox():
+def test_lines_are_read_and_sampled_as_in_the_toolbox(read):
     cases = read("stability_cases.json")
     for case in cases["interpolate"]:
         line = np.array(case["poly"], dtype=float)
@@ -149,8 +155,7 @@ def test_lines_are_read_and_sampled_as_in_the_toolbox():
         np.testing.assert_allclose(found, case["points"], atol=1e-6)
 
 
-@pytest.mark.reference
-def test_single_values_and_costs_are_those_of_the_toolbox():
+def test_single_values_and_costs_are_those_of_the_toolbox(read):
     cases = read("stability_cases.json")
     for current, previous, value in cases["presence_cur_pre_value"]:
         scores = np.array([[current], [previous]], dtype=np.float32)
