@@ -48,6 +48,7 @@ def test_mapping_and_measuring_in_one_go(predmapnet, tiny_root, random_weights, 
     assert "chamfer AP" in first.out and "frames/s" in first.out
     content = json.loads(figures.read_text())
     assert content["scenes"] == 2 and content["evaluated"]["dataset"] == "nuscenes"
+    assert content["stability"]["protocol"] == "anchored" and content["stability"]["interval"] == 2
     assert report.read_text().startswith("<!doctype html>")
 
 

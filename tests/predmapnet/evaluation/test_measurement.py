@@ -20,6 +20,7 @@ from predmapnet.evaluation.precision_recall import accumulate
 from predmapnet.evaluation.raster_ap import raster_average_precision
 from predmapnet.evaluation.report import write_figures, write_report
 from predmapnet.evaluation.scene_figures import SCENE_FIGURES, scene_figures
+from predmapnet.evaluation.stability import scene_instances, stability
 from predmapnet.scenes import FrameTruth
 
 RING = np.array([[10.0, -3.0], [14.0, -3.0], [14.0, 5.0], [10.0, 5.0], [10.0, -3.0]])
@@ -93,6 +94,9 @@ def test_the_figures_together_are_those_of_each_metric_alone(case):
     for section, half in (("ahead_ap", Half.AHEAD), ("rear_ap", Half.REAR)):
         matches = [half_matches(frame, half, standard) for frame in frames]
         assert figures[section] == accumulate(matches, standard).figures()
+    ids = [frame.truth.element_ids for frame in frames]
+    steady = stability([(frames, scene_instances(frames, ids))])
+    assert figures["stability"] == steady.figures() and figures["stability"]["protocol"] == "anchored"
     assert figures["raster_ap"] == raster_average_precision(frames).figures()
     assert figures["consistency_ap"].items() >= consistency_average_precision(frames).figures().items()
     pooled = {name: figures[section][key] for name, (section, key) in POOLED.items()}
