@@ -9,6 +9,8 @@ from scipy.spatial import cKDTree
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import RegionOfInterest
 
+FARTHEST_POSE = 1e10
+"""Poses farther from the origin of their frame are none, metres; UTM takes ten million."""
 UNIT_TOLERANCE = 1e-14
 """Distance from 1 up to which a squared quaternion length counts as 1."""
 
@@ -55,6 +57,8 @@ def rigid_pose_problem(a_to_b: Float) -> str | None:
         return "pose is not 4 x 4"
     if not np.isfinite(pose).all():
         return "pose is not finite"
+    if np.abs(pose[:3, 3]).max() > FARTHEST_POSE:
+        return f"pose lies more than {FARTHEST_POSE:g} m away"
     rotation = pose[:3, :3]
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
     determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)

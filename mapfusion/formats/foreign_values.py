@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
+
+from mapfusion import json_text
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TIME = re.compile(
@@ -74,7 +75,7 @@ def number_of(value: Any) -> float | None:
 def json_of(text: str | None) -> Any:
     """Return what JSON text holds; None for no text, or for what is no JSON."""
     try:
-        return None if text is None else json.loads(text)
+        return None if text is None else json_text.parse(text.encode())
     except ValueError:
         return None
 
@@ -82,7 +83,7 @@ def json_of(text: str | None) -> Any:
 def list_of(value: Any) -> list[Any] | None:
     """Return a list, also one that is written as JSON text; None for null. Raises ValueError."""
     if isinstance(value, str):
-        value = json.loads(value) if value.strip() else None
+        value = json_text.parse(value.encode()) if value.strip() else None
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if value is None or isinstance(value, list):

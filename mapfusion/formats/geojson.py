@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from mapfusion import json_text
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.features import Feature, map_of
@@ -135,8 +136,8 @@ def read_geojson(path: Path, georeference: InvertibleGeoreference | None = None)
         OSError: the file cannot be read.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        document = json_text.parse(path.read_bytes())
+    except ValueError as error:
         raise ValueError(f"{path}: not JSON: {error}") from error
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise ValueError(f"{path}: not a GeoJSON FeatureCollection")

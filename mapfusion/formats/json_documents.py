@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from mapfusion import json_text
 from mapfusion.elements import ElementKind
 from mapfusion.formats.frame_ties import MEMBER, TiedFrame
 
@@ -25,8 +25,8 @@ def read_document(path: Path, what: str) -> Iterator[tuple[dict[str, Any], dict[
         what: it should be, for messages.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
+        document = json_text.parse(path.read_bytes())
+    except ValueError as error:
         raise ValueError(f"{path}: not JSON, and so no map: {error}") from error
     origin = document.get(MEMBER) if isinstance(document, dict) else None
     if not isinstance(origin, dict):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import shapely
 
+from mapfusion import json_text
 from mapfusion.elements import ElementKind, GlobalMap
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.lanelet2 import LOCAL_PLANE, PREFIX, TYPES
@@ -40,7 +40,7 @@ def read_lanelet(path: Path, georeference: InvertibleGeoreference | None = None)
     notes = ReadingNotes()
     meta = root.find("meta")
     try:
-        origin = None if meta is None else json.loads(meta.attrib["provenance"])
+        origin = None if meta is None else json_text.parse(meta.attrib["provenance"].encode())
         local = isinstance(origin, dict) and LOCAL_FRAME in origin
         features = list(_Document(root, local, notes).features())
     except (KeyError, ValueError) as error:

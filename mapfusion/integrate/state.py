@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
@@ -13,6 +12,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion import json_text
+from mapfusion.array_files import read_arrays
 from mapfusion.elements import ElementKind
 from mapfusion.files import write_whole
 from mapfusion.integrate.config import IntegratorConfig
@@ -113,14 +114,15 @@ def save_state(state: IntegratorState, path: Path) -> None:
 def load_state(path: Path) -> IntegratorState:
     """Read the state that :func:`save_state` wrote; raises ValueError for other files, OSError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(arrays["header"].tobytes())
-    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        arrays = read_arrays(path)
+        header = json_text.parse(arrays["header"].tobytes())
+        version = header.get("format")
+        state = _restored(header, arrays) if version == STATE_VERSION else None
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise ValueError(f"{path}: not the saved state of a map integrator: {error}") from error
-    if header.get("format") != STATE_VERSION:
-        raise ValueError(f"{path}: layout {header.get('format')} of another version; this one reads {STATE_VERSION}")
-    return _restored(header, arrays)
+    if state is None:
+        raise ValueError(f"{path}: layout {version} of another version; this one reads {STATE_VERSION}")
+    return state
 
 
 def _restored(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> IntegratorState:

@@ -6,14 +6,14 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Tag
 
-from predmapnet.config.section import AttentionSection, Distances, Fraction, Positive, Quirks, Section, kind_of
+from predmapnet.config.section import AttentionSection, Distances, Few, Fraction, Positive, Quirks, Section, kind_of
 
 
 class SemanticQueriesConfig(Section):
     """Semantic-Aware Query Generator, Sec. 3.2; switched off, detection queries are learned only."""
 
     enabled: bool = True
-    layers: Positive = 2
+    layers: Few = 2
     """L of the paper."""
     mask_threshold: Fraction = 0.5
     """tau_L of eq. 1."""
@@ -47,7 +47,7 @@ class FutureConfig(Section):
     """Short-Term Future Guidance, Sec. 3.5."""
 
     enabled: bool = True
-    histories: Positive = 4
+    histories: Few = 4
     """n of the paper."""
     hidden: Positive = 256
     steady_motion: bool = False
@@ -65,12 +65,12 @@ class PointDecoderConfig(AttentionSection):
     kind: Literal["points"] = "points"
     query_assignment: Literal["one_way", "suppress"] = "one_way"
     queries: Positive = 40
-    points: Annotated[int, Field(ge=2)] = 20
+    points: Annotated[int, Field(ge=2, le=1_000)] = 20
     width: Positive = 128
-    heads: Positive = 8
-    layers: Positive = 4
+    heads: Few = 8
+    layers: Few = 4
     point_width: Positive = 64
-    sampling_offsets: Positive = 2
+    sampling_offsets: Few = 2
     classes: Literal[3] = 3
 
 
@@ -100,10 +100,10 @@ class MapTrackerDecoderConfig(AttentionSection):
     kind: Literal["maptracker"] = "maptracker"
     query_assignment: Literal["suppress"] = "suppress"
     queries: Positive = 100
-    points: Annotated[int, Field(ge=2)] = 20
+    points: Annotated[int, Field(ge=2, le=1_000)] = 20
     width: Annotated[int, Field(gt=0, multiple_of=4)] = 512
-    heads: Positive = 8
-    layers: Positive = 6
+    heads: Few = 8
+    layers: Few = 6
     hidden: Positive = 1024
     dropout: Fraction = 0.1
     classes: Literal[3] = 3

@@ -8,7 +8,9 @@ from pydantic import Field, Tag, model_validator
 
 from predmapnet.config.section import (
     AttentionSection,
+    Cells,
     Distances,
+    Few,
     Fraction,
     Metres,
     Positive,
@@ -66,7 +68,7 @@ class SmallBackboneConfig(Section):
 
     stem: tuple[Positive, Positive] = (16, 32)
     widths: tuple[Positive, Positive, Positive] = (32, 48, 96)
-    blocks: tuple[Positive, Positive, Positive] = (1, 2, 2)
+    blocks: tuple[Few, Few, Few] = (1, 2, 2)
     channels: Positive = 32
 
 
@@ -113,8 +115,8 @@ class LookupBevConfig(Section):
     """
 
     kind: Literal["lookup"] = "lookup"
-    rows: Positive = 50
-    columns: Positive = 100
+    rows: Cells = 50
+    columns: Cells = 100
     widths: tuple[Positive, Positive, Positive] = (48, 80, 128)
     further_heights: tuple[float, ...] = ()
     backbone: SmallBackboneConfig = SmallBackboneConfig()
@@ -153,11 +155,11 @@ class BevFormerConfig(AttentionSection):
     """
 
     kind: Literal["bevformer"] = "bevformer"
-    rows: Positive = 50
-    columns: Positive = 100
+    rows: Cells = 50
+    columns: Cells = 100
     width: Annotated[int, Field(gt=0, multiple_of=2)] = 256
-    heads: Positive = 8
-    layers: Positive = 2
+    heads: Few = 8
+    layers: Few = 2
     hidden: Positive = 512
     dropout: Fraction = 0.1
     cameras: Annotated[tuple[str, ...], Field(min_length=1)] = NUSCENES_CAMERAS

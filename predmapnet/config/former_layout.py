@@ -10,6 +10,8 @@ MOVED = (
     ("masks", "stride", "bev", "mask_stride"),
     ("tracking", "query_assignment", "decoder", "query_assignment"),
 )
+FORMER = ("backbone", "temporal_bev", "quirks")
+"""Sections that are parts of others now."""
 ENCODER_QUIRKS = {"mirrored_self_attention", "propagate_where_sum_is_positive", "endpoint_warp_grid"}
 
 
@@ -19,10 +21,13 @@ def in_present_layout(values: Mapping[str, Any]) -> dict[str, Any]:
     It was checked when it was written: image backbone and BEV memory are those that the BEV encoder needs.
     """
     sections = {name: deepcopy(value) for name, value in values.items()}
+    touched = {name for row in MOVED for name in row[::2]} | {"bev", "decoder", *FORMER}
+    if any(not isinstance(sections.get(name) or {}, dict) for name in touched):
+        return sections  # what is wrong is told where its sections are checked
     for section, key, target, name in MOVED:
         if isinstance(sections.get(section), dict) and key in sections[section]:
             sections.setdefault(target, {})[name] = sections[section].pop(key)
-    backbone, memory, quirks = (sections.pop(name, None) for name in ("backbone", "temporal_bev", "quirks"))
+    backbone, memory, quirks = (sections.pop(name, None) for name in FORMER)
     for name, part in (("backbone", backbone), ("memory", memory)):
         if part is not None and (part.pop("kind", None), name) != ("resnet50", "backbone"):
             sections.setdefault("bev", {})[name] = part

@@ -8,9 +8,12 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, model_validator
 
-Positive = Annotated[int, Field(gt=0)]
+Positive = Annotated[int, Field(gt=0, le=65_536)]
+Few = Annotated[int, Field(gt=0, le=64)]
+"""Layers, blocks, and what else a network has a handful of."""
+Cells = Annotated[int, Field(gt=0, le=1_000)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Metres = Annotated[float, Field(gt=0.0)]
+Metres = Annotated[float, Field(gt=0.0, le=10_000.0)]
 
 
 def _increasing(values: tuple[float, ...]) -> tuple[float, ...]:
@@ -26,14 +29,14 @@ Distances = Annotated[tuple[Metres, ...], Field(min_length=1), AfterValidator(_i
 class Section(BaseModel):
     """Base of all sections: unknown keys are refused and values do not change after construction."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class AttentionSection(Section):
     """Base of sections with attention: each head takes its share of the width."""
 
     width: Positive
-    heads: Positive
+    heads: Few
 
     @model_validator(mode="after")
     def _heads_share_the_width(self) -> Self:

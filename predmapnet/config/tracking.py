@@ -31,7 +31,7 @@ class TrackingConfig(Section):
     merge: bool = True
     merge_distance: Metres = 2.0
     duplicate_distance: Metres = 1.5
-    merge_samples: Annotated[int, Field(ge=2)] = 50
+    merge_samples: Annotated[int, Field(ge=2, le=1_000)] = 50
     report_threshold: Fraction = 0.05
 
 

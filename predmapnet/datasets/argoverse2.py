@@ -226,10 +226,10 @@ class Argoverse2Scene:
         self.timestamps = timestamps
         self._folder = folder
         self._poses = read_table(folder / POSES, ("timestamp_ns", *QUATERNION, *TRANSLATION))
-        self._pose_rows = {int(time): row for row, time in enumerate(self._poses["timestamp_ns"])}
         if len(self.timestamps) == 0:
             raise UserError(f"{folder} names no lidar sweep and no image that is a frame, so it has none.")
         self._check_drive()
+        self._pose_rows = {int(time): row for row, time in enumerate(self._poses["timestamp_ns"])}
 
     def _check_drive(self) -> None:
         """Raise UserError for times of another unit, and for poses that no car has."""
@@ -237,6 +237,7 @@ class Argoverse2Scene:
         times = self._poses["timestamp_ns"]
         if not np.issubdtype(times.dtype, np.integer):
             raise UserError(f"{path}: the column timestamp_ns must hold integer nanoseconds, not {times.dtype}.")
+        times = self._poses["timestamp_ns"] = times.astype(np.int64)
         order = np.argsort(times, kind="stable")
         table = {name: values[order] for name, values in self._poses.items()}
         quaternions = np.stack([table[name] for name in QUATERNION], axis=1).astype(np.float64)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyarrow import ArrowInvalid, feather, types
+from pyarrow import types
 
 from mapfusion.arrays import Integer
+from predmapnet.arrow_tables import arrow_errors_told, read_feather
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.datasets.splits import SPLITS
 from predmapnet.errors import UserError
@@ -80,6 +81,10 @@ def city(folder: Path) -> str:
 def rows_by_sensor(path: Path, columns: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Read a calibration table: its rows by sensor. Raises UserError like :func:`read_table`."""
     table = read_table(path, columns, texts=("sensor_name",))
+    names = [str(name) for name in table["sensor_name"]]
+    if len(set(names)) < len(names):
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise UserError(f"{path} describes the sensor {repeated} twice. Which is right? Keep one row.")
     return {
         str(name): {column: values[row] for column, values in table.items()}
         for row, name in enumerate(table["sensor_name"])
@@ -91,17 +96,18 @@ def read_table(path: Path, columns: tuple[str, ...], texts: tuple[str, ...] = ()
 
     Raises UserError where the file is missing or damaged, or lacks a column of that kind.
     """
-    try:
-        table = feather.read_table(path)
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist. The log is incomplete: fetch it again.") from None
-    except (ArrowInvalid, OSError) as error:
-        raise UserError(f"{path} is not a readable feather file ({error}). Fetch it again.") from None
-    missing = [name for name in (*columns, *texts) if name not in table.column_names]
+    table = read_feather(path)
+    there = table.column_names
+    missing = [name for name in (*columns, *texts) if there.count(name) != 1]
     if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(table.column_names)}.")
+        raise UserError(f"{path} lacks the columns {', '.join(missing)}, or has them twice; it has {', '.join(there)}.")
     for name in columns:
         kind = table.schema.field(name).type
         if not (types.is_integer(kind) or types.is_floating(kind)):
             raise UserError(f"{path}: the column {name} must hold numbers, not {kind}.")
-    return {name: table.column(name).to_numpy() for name in (*columns, *texts)}
+    for name in texts:
+        kind = table.schema.field(name).type
+        if not (types.is_string(kind) or types.is_large_string(kind) or types.is_dictionary(kind)):
+            raise UserError(f"{path}: the column {name} must hold texts, not {kind}.")
+    with arrow_errors_told(path, "feather"):
+        return {name: table.column(name).to_numpy() for name in (*columns, *texts)}

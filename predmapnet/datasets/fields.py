@@ -10,6 +10,9 @@ import numpy as np
 from mapfusion.arrays import Float
 from predmapnet.errors import UserError
 
+EXACT = 2**53
+"""Whole numbers below are exact whatever number they are stored as."""
+
 
 def text_field(record: Mapping[str, Any], name: str, where: str) -> str:
     """Return a field that is a text. Raises UserError if it is missing or something else."""
@@ -20,23 +23,33 @@ def text_field(record: Mapping[str, Any], name: str, where: str) -> str:
 
 
 def whole_field(record: Mapping[str, Any], name: str, where: str) -> int:
-    """Return a field that is an integer. Raises UserError if it is missing or something else."""
+    """Return a field that is an integer. Raises UserError if it is missing, too large or something else."""
     value = record.get(name)
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer)) or value != value // 1:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)) or value != value // 1:
         raise _wrong(record, name, "a whole number", where)
+    if not -(2**63) <= value < 2**63:
+        raise _wrong(record, name, "a whole number of 64 bits", where)
     return int(value)
 
 
 def numbers_field(record: Mapping[str, Any], name: str, shape: tuple[int, ...], where: str) -> Float:
     """Return a field that holds finite numbers of a shape. Raises UserError if it is missing or something else."""
     try:
-        numbers = np.array(record.get(name), dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.zeros(0)
-    if numbers.shape != shape or not np.isfinite(numbers).all():
+        found = numbers(record.get(name))
+    except ValueError:
+        found = np.zeros(0)
+    if found.shape != shape or not np.isfinite(found).all():
         expected = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
         raise _wrong(record, name, expected, where)
-    return numbers
+    return found
+
+
+def numbers(value: Any) -> Float:
+    """Return the numbers of a list, or of lists of equal length. Raises ValueError for everything else."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, OverflowError) as error:
+        raise ValueError(str(error)) from None
 
 
 def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> UserError:
@@ -53,4 +66,8 @@ def check_principal_point(intrinsics: Float, width: int, height: int, where: str
         raise UserError(
             f"{where}: the intrinsics (focal lengths {intrinsics[0, 0]:g} and {intrinsics[1, 1]:g}, principal point "
             f"{x:g}, {y:g}) are not those of images of {width} x {height} pixels. Were the images scaled?"
+        )
+    if not 0.25 < intrinsics[0, 0] / intrinsics[1, 1] < 4.0:
+        raise UserError(
+            f"{where}: the focal lengths {intrinsics[0, 0]:g} and {intrinsics[1, 1]:g} differ as those of no camera."
         )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -19,8 +21,15 @@ _JPEG_END = b"\xff\xd9"
 _AS_STORED = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 """Calibration belongs to the pixels as they are stored, so the EXIF orientation is not applied."""
 
-_END_OR_STRAY = re.compile(rb"\xff[^\x00\xff\xd0-\xd7\xda\xc4\xdb-\xdd\xe0-\xef\xfe]", re.DOTALL)
-"""The end, or else a byte after 0xFF that no writer puts into the pixels: no stuffed zero, restart or segment."""
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
+"""What ends the pixels of a scan: no stuffed zero, and no restart."""
+_SEGMENTS = {0xC4, 0xDA, 0xDB, 0xDC, 0xDD, *range(0xE0, 0xF0), 0xFE}
+"""Markers of segments that may stand between scans."""
+_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+"""Markers of segments that tell the size of the image."""
+MOST_PIXELS = 1 << 27
+"""No camera of a car has more; a header that says so would only fill the memory."""
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -32,10 +41,12 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(f"Cannot read the image {path}: {error.strerror}.") from None
-    # OpenCV fills a JPEG that was cut short or damaged with grey and says nothing that a program hears.
-    if data[:2] == _JPEG_START:
-        check_jpeg(data, f"The image {path}")
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _AS_STORED) if data else None
+    # OpenCV fills an image that was cut short or damaged with grey and says nothing that a program hears.
+    image_size(data, f"The image {path}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _AS_STORED)
+    except cv2.error:
+        image = None
     if image is None:
         raise UserError(f"{path} ({len(data)} bytes) is not an image that can be decoded. Copy or fetch it again.")
     return np.asarray(image, dtype=np.uint8)
@@ -57,44 +68,65 @@ def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     return undistorted(image, camera)
 
 
-@dataclass(frozen=True)
-class _Header:
-    """Header of a JPEG: where its pixels begin (past thumbnails and comments), and whether it is a baseline JPEG."""
+def image_size(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height of a JPEG or PNG, of which no pixel is decoded.
 
-    pixels: int
-    baseline: bool
+    Raises UserError, which begins with ``where``, for one that is damaged, cut short, larger than any camera's, or
+    something else.
+    """
+    if data.startswith(_JPEG_START):
+        width, height = _checked_jpeg(data, where)
+    elif data.startswith(_PNG_START):
+        width, height = _checked_png(data, where)
+    else:
+        raise UserError(f"{where} ({len(data)} bytes) is neither a JPEG nor a PNG. Copy or fetch it again.")
+    if width * height > MOST_PIXELS:
+        raise UserError(f"{where} would have {width} x {height} pixels, as no camera has. Copy or fetch it again.")
+    return width, height
 
 
-def check_jpeg(data: bytes, where: str) -> None:
-    """Raise UserError for a JPEG without an end, or with bytes in its pixels that no writer puts there.
+def _checked_jpeg(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height of a JPEG; UserError for one without an end, or with bytes that no writer puts there.
 
     What some cameras write after the end does not matter.
     """
-    header = _header(data)
-    if header.baseline:
-        found = _END_OR_STRAY.search(data, header.pixels)
-        end = -1 if found is None else found.start()
-    else:
-        end = data.find(_JPEG_END, header.pixels)
-    if end < 0:
-        raise UserError(f"{where} is cut short after {len(data)} bytes. Copy or fetch it again.")
-    if data[end : end + 2] != _JPEG_END:
-        raise UserError(f"{where} is damaged at byte {end}. Copy or fetch it again.")
-
-
-def _header(data: bytes) -> _Header:
-    position, baseline = 2, False
-    while position + 4 <= len(data) and data[position] == 0xFF:
+    position, size = 2, (0, 0)
+    scanning = False
+    while True:
+        if scanning:  # pixels, up to the next marker
+            found = _MARKER.search(data, position)
+            position = len(data) if found is None else found.start()
+        if position + 4 > len(data) and data[position : position + 2] != _JPEG_END:
+            raise UserError(f"{where} is cut short after {len(data)} bytes. Copy or fetch it again.")
         marker = data[position + 1]
-        length = int.from_bytes(data[position + 2 : position + 4])
-        if marker == 0xDA:
-            return _Header(position + 2 + length, baseline)
-        baseline |= marker == 0xC0
+        if data[position] != 0xFF or (scanning and marker not in _SEGMENTS and marker != _JPEG_END[1]):
+            raise UserError(f"{where} is damaged at byte {position}. Copy or fetch it again.")
+        if marker == _JPEG_END[1]:
+            return size
         # Fill bytes and markers without a length are passed over.
         if marker == 0xFF:
             position += 1
         elif marker == 0x01 or 0xD0 <= marker <= 0xD7:
             position += 2
         else:
-            position += 2 + length
-    return _Header(position, False)
+            if marker in _FRAMES:
+                height, width = struct.unpack(">HH", data[position + 5 : position + 9].ljust(4, b"\0"))
+                size = max(size, (width, height), key=math.prod)
+            scanning |= marker == 0xDA
+            position += 2 + max(2, int.from_bytes(data[position + 2 : position + 4]))
+
+
+def _checked_png(data: bytes, where: str) -> tuple[int, int]:
+    """Return width and height of a PNG; UserError for one without an end, or with a checksum that does not fit."""
+    position = len(_PNG_START)
+    while data[position + 4 : position + 8] != b"IEND":
+        length = int.from_bytes(data[position : position + 4])
+        end = position + 12 + length
+        if end > len(data):
+            raise UserError(f"{where} is cut short after {len(data)} bytes. Copy or fetch it again.")
+        critical = not data[position + 4] & 0x20  # others say nothing of the pixels
+        if critical and zlib.crc32(data[position + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
+            raise UserError(f"{where} is damaged between bytes {position} and {end}. Copy or fetch it again.")
+        position = end
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
 import mmap
 import re
 from collections.abc import Callable, Iterator
@@ -13,8 +12,7 @@ from itertools import compress
 from pathlib import Path
 from typing import Any, TypeVar
 
-import orjson
-
+from mapfusion import json_text
 from predmapnet.errors import UserError
 
 Record = dict[str, Any]
@@ -25,7 +23,6 @@ PIECE = 8_000_000
 
 _BETWEEN_RECORDS = re.compile(rb"\}\s*,\s*(?=\{)")
 _BEGINNING = re.compile(rb"(?:\xef\xbb\xbf)?\s*\[")
-_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
 @dataclass(frozen=True)
@@ -73,16 +70,12 @@ def select_records(path: Path, keep: Callable[[Record], Kept | None], mark: Mark
         raise UserError(f"Cannot read {path}: {error.strerror}.") from None
 
 
-def parse_json(data: bytes, path: Path) -> Any:
-    """Parse JSON that may begin with a byte-order mark and hold NaN. Raises UserError."""
-    data = data.removeprefix(_BYTE_ORDER_MARK)
+def parse_json(data: bytes, path: Path, unique: bool = False) -> Any:
+    """Parse JSON as :func:`mapfusion.json_text.parse` does, but raise UserError."""
     try:
-        return orjson.loads(data)
-    except orjson.JSONDecodeError as error:
-        try:
-            return json.loads(data)
-        except (ValueError, RecursionError):
-            raise UserError(f"{path} is not valid JSON ({error}). The file is damaged: fetch it again.") from None
+        return json_text.parse(data, unique)
+    except ValueError as error:
+        raise UserError(f"{path} is not valid JSON: {error}. Is the file whole?") from None
 
 
 def _select_in_pieces(
@@ -106,12 +99,9 @@ def _select_in_pieces(
 def _parse(piece: bytes) -> Any:
     """Parse records without their list; raises _CutInsideError."""
     try:
-        return orjson.loads(b"[%b]" % piece)
-    except orjson.JSONDecodeError:
-        try:
-            return json.loads(b"[%b]" % piece)
-        except (ValueError, RecursionError):
-            raise _CutInsideError from None
+        return json_text.parse(b"[%b]" % piece)
+    except ValueError:
+        raise _CutInsideError from None
 
 
 def _marked(piece: bytes, mark: Mark) -> bytes | None:

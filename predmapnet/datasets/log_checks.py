@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapfusion.arrays import Float, Integer
+from predmapnet.datasets.fields import numbers
 from predmapnet.datasets.plausibility import (
     camera_problem,
     judged_unit,
@@ -72,8 +73,8 @@ def usable_poses(stored: Sequence[tuple[object, object]]) -> tuple[list[int], Fl
     for row, (rotation, translation) in enumerate(stored):
         quaternion = unit_quaternions([rotation])
         try:
-            position = np.array(translation, dtype=np.float64)
-        except (TypeError, ValueError):
+            position = numbers(translation)
+        except ValueError:
             continue
         if len(quaternion) and position.shape == (3,) and np.isfinite(position).all():
             rows.append(row)

@@ -14,7 +14,7 @@ from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from mapfusion.georeference import Georeference
-from predmapnet.datasets.fields import check_principal_point, numbers_field, text_field, whole_field
+from predmapnet.datasets.fields import EXACT, check_principal_point, numbers_field, text_field, whole_field
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map_file
@@ -34,6 +34,8 @@ OLD_MINI_SPLIT = {"train": "nuscenes_mini_train", "val": "nuscenes_mini_val"}
 NEW_SPLIT = {"train": "nuscenes_new_train", "val": "nuscenes_new_val"}
 DEMO_MARKER = "demo_world.json"
 """A data set with this file in its root was rendered by the demo world."""
+SEEDS = 10_000
+"""Number of the demo world's towns that have a place on Earth."""
 LEFT_OUT = "left out of the published training sets"
 
 
@@ -130,20 +132,23 @@ class NuScenesSource:
 
     def scenes_of(self, tokens: Iterable[str]) -> dict[str, str]:
         """Look up which scenes frames belong to, by sample token; unknown tokens are absent."""
-        names = {record.get("token"): name for name, record in self.tables.scenes.items()}
+        names = {str(record.get("token")): name for name, record in self.tables.scenes.items()}
         samples = ((token, self.tables.samples.get(token)) for token in tokens)
         return {
-            token: names[sample["scene_token"]]
+            token: names[str(sample["scene_token"])]
             for token, sample in samples
-            if sample is not None and sample.get("scene_token") in names
+            if sample is not None and str(sample.get("scene_token")) in names
         }
 
     def _georeference(self, info: SceneInfo) -> Georeference | None:
         """Return the georeference of a scene; rendered towns carry a borrowed location, but lie in the ocean."""
         if not self.synthetic:
             return nuscenes_georeference(info.location)
-        marker = read_map_file(self.root / DEMO_MARKER)[0]
-        return demo_georeference(f"demo world, {info.name}", int(marker.get("town_seed", 0)))
+        path = self.root / DEMO_MARKER
+        seed = whole_field({"town_seed": 0, **read_map_file(path)[0]}, "town_seed", str(path))
+        if not 0 <= seed < SEEDS:
+            raise UserError(f"{path}: there is no town {seed}; towns are numbered from 0 to {SEEDS - 1}.")
+        return demo_georeference(f"demo world, {info.name}", seed)
 
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
         if location not in self._maps:
@@ -262,6 +267,8 @@ class NuScenesScene:
         rows, quaternions, positions = usable_poses([(pose.get("rotation"), pose.get("translation")) for pose in poses])
         check_clock(times[rows], positions, "microseconds", f"{path('sample')}, {name}")
         check_drive(quaternions, positions, f"{path('ego_pose')}, {name}")
+        if np.abs(times).max() >= EXACT:
+            raise UserError(f"{path('sample')}, {name}: the time {times[0]} is too large for microseconds.")
 
     def _where(self, index: int, table: str) -> str:
         return f"{self.info.name}, frame {index}, {self._tables.folder / table}.json"

@@ -130,7 +130,14 @@ class Tables:
 
     def _by_token(self, table: str) -> dict[str, Record]:
         where = str(self.path(table))
-        return {text_field(record, "token", where): record for record in self.read(table)}
+        found: dict[str, Record] = {}
+        for record in self.read(table):
+            token = text_field(record, "token", where)
+            if found.setdefault(token, record) != record:
+                raise UserError(
+                    f"{where}: two different records have the token {token[:60]}. Which is right? Keep one."
+                )
+        return found
 
     @cached_property
     def _key_frames(self) -> dict[str, dict[str, SensorData]]:
@@ -157,8 +164,9 @@ class Tables:
                 raise UserError(f"{path}: record {record.get('token')} names a calibrated sensor that does not exist.")
             if calibration in channels:
                 sample = text_field(record, "sample_token", str(path))
-                data = SensorData(*map(record.get, SensorData._fields))
-                result.setdefault(sample, {})[channels[calibration]] = data
+                data, channel = SensorData(*map(record.get, SensorData._fields)), channels[calibration]
+                if result.setdefault(sample, {}).setdefault(channel, data) != data:
+                    raise UserError(f"{path}: sample {sample[:60]} has two key frames of {channel}. Which is right?")
 
         select_records(path, keep, Mark(_KEY_FRAME, {b"true"}.__contains__))
         return result

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapfusion.arrays import Bool, Float, Integer
+from predmapnet.datasets.fields import numbers
 
 NANOSECONDS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000, "nanoseconds": 1}
 """Nanoseconds of each unit."""
@@ -124,8 +125,8 @@ def unit_quaternions(values: Sequence[object]) -> Float:
     found = []
     for value in values:
         try:
-            quaternion = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
+            quaternion = numbers(value)
+        except ValueError:
             continue
         if quaternion.shape == (4,) and abs(float(np.linalg.norm(quaternion)) - 1.0) < 1e-3:
             found.append(quaternion)

@@ -38,9 +38,13 @@ def csv_pose_rows(path: Path, how: str) -> list[tuple[str, Mapping[str, Any]]]:
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file))
+            reader = csv.DictReader(file)
+            rows, names = list(reader), [name.strip() for name in reader.fieldnames or () if name]
     except (UnicodeDecodeError, csv.Error) as error:
         raise UserError(f"{path} is no CSV in UTF-8: {error}. Save it as UTF-8.") from error
+    repeated = next((name for name in names if names.count(name) > 1), None)
+    if repeated is not None:
+        raise UserError(f"{path} has two columns {repeated}. Which is right? Keep one.")
     result: list[tuple[str, Mapping[str, Any]]] = []
     for line, row in enumerate(rows, start=2):
         values: dict[str, Any] = {key.strip(): value for key, value in row.items() if key and value not in (None, "")}

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapfusion.arrays import Float
-from mapfusion.geometry import rotation_of_quaternion
+from mapfusion.geometry import FARTHEST_POSE, rotation_of_quaternion
+from predmapnet.datasets.fields import numbers
 from predmapnet.errors import UserError
 
 QUATERNION_TOLERANCE = 1e-3
@@ -45,18 +46,18 @@ def pose_matrix(rotation_wxyz: Sequence[float], translation: Sequence[float], wh
     Raises UserError, naming ``where``, for values that are missing or not finite, and for no rotation.
     """
     try:
-        quaternion = np.array(rotation_wxyz, dtype=np.float64).reshape(4)
-        offset = np.array(translation, dtype=np.float64).reshape(3)
-    except (TypeError, ValueError):
+        quaternion, offset = numbers(rotation_wxyz).reshape(4), numbers(translation).reshape(3)
+    except ValueError:
         raise UserError(
             f"{where}: a pose needs a rotation of 4 numbers and a translation of 3, "
             f"but has rotation {rotation_wxyz} and translation {translation}."
         ) from None
     norm = float(np.linalg.norm(quaternion))
-    if not (np.isfinite(offset).all() and np.isfinite(norm) and abs(norm - 1.0) <= QUATERNION_TOLERANCE):
+    if not (np.abs(offset) <= FARTHEST_POSE).all() or not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
         raise UserError(
             f"{where}: the pose is not a rigid motion: rotation (w, x, y, z) {quaternion.tolist()} of length "
-            f"{norm:.6g} (must be 1), translation {offset.tolist()} m (must be finite). Repair or remove this frame."
+            f"{norm:.6g} (must be 1), translation {offset.tolist()} m (must be finite, and "
+            f"at most {FARTHEST_POSE:g}). Repair or remove this frame."
         )
     pose = np.eye(4)
     pose[:3, :3] = rotation_of_quaternion(quaternion)

@@ -25,6 +25,8 @@ WIDEST = np.array([np.tan(np.radians(60.0)), np.tan(np.radians(45.0))])
 """Largest angle of a pinhole to each side, and up and down: as wide as networks have learned to see."""
 MOST_PITCH = np.radians(12.0)
 """A pinhole behind a fisheye looks down by no more than this, radians, nor is it tilted to a side."""
+PIXELS_AT_A_TIME = 1 << 20
+"""Rays of so many pixels are held at a time."""
 NARROWEST = 0.02
 """Tangent that a pinhole has at least from side to side."""
 
@@ -179,11 +181,14 @@ def undistorted(image: Image, camera: Camera) -> Image:
 def _table(lens: Lens, pinhole: bytes, width: int, height: int) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
     """Return where each pixel of the pinhole's image comes from, as ``cv2.remap`` takes it; made once per camera."""
     to_ray = np.linalg.inv(np.frombuffer(pinhole).reshape(3, 3))
-    column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.column_stack([column.ravel(), row.ravel(), np.ones(width * height)]) @ to_ray.T
-    pixels, seen = lens.project(rays @ lens.turn)
-    # OpenCV's pixels have their centres at whole numbers; far outside stands for unseen.
-    pixels = np.where(seen[:, None], pixels - 0.5, -1e4).clip(-1e4, 3e4).astype(np.float32)
-    maps = pixels.reshape(height, width, 2)
+    maps = np.empty((height, width, 2), dtype=np.float32)
+    band = max(1, PIXELS_AT_A_TIME // width)
+    for top in range(0, height, band):
+        column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(top, min(top + band, height)) + 0.5)
+        rays = np.column_stack([column.ravel(), row.ravel(), np.ones(column.size)]) @ to_ray.T
+        pixels, seen = lens.project(rays @ lens.turn)
+        # OpenCV's pixels have their centres at whole numbers; far outside stands for unseen.
+        pixels = np.where(seen[:, None], pixels - 0.5, -1e4).clip(-1e4, 3e4)
+        maps[top : top + band] = pixels.reshape(*column.shape, 2)
     coarse, fine = cv2.convertMaps(maps[..., 0], maps[..., 1], cv2.CV_16SC2)
     return np.asarray(coarse, dtype=np.int16), np.asarray(fine, dtype=np.uint16)

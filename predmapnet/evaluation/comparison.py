@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 
 from mapfusion.arrays import Bool, Float, Integer
 from mapfusion.merge.report import short_names
+from predmapnet.datasets.fields import EXACT
+from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
 from predmapnet.evaluation.scene_figures import SCENE_FIGURES
 
@@ -146,12 +147,9 @@ def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = orjson.loads(path.read_bytes())
-    except FileNotFoundError as error:
-        raise UserError(f"There is no file {path}.") from error
-    except orjson.JSONDecodeError as error:
-        raise UserError(f"{path} is not valid JSON: {error}.") from error
+    if not path.is_file():
+        raise UserError(f"There is no file {path}.")
+    content = parse_json(path.read_bytes(), path)
     if not isinstance(content, dict) or not isinstance(content.get("evaluated"), dict):
         raise UserError(f"{path} is no evaluation; make one with 'predmapnet evaluate --json {path.name}'.")
     per_scene = content.get("per_scene")
@@ -162,10 +160,23 @@ def _read(path: Path) -> dict[str, Any]:
             "run 'predmapnet evaluate --json' again."
         )
     for scene, figures in per_scene.items():
-        wrong = [name for name in SCENE_FIGURES if not isinstance(figures.get(name), int | float | None)]
+        wrong = [name for name in SCENE_FIGURES if not isinstance(figures, dict) or not _is_figure(figures.get(name))]
         if wrong:
             raise UserError(f"{path}: {wrong[0]} of {scene} is no number.")
+    for section, name in [*_POOLED.values(), ("stability", "interval")]:
+        figures = content.get(section) or {}
+        if not isinstance(figures, dict) or not _is_figure(figures.get(name)):
+            raise UserError(f"{path}: {name} of {section} is no number.")
+    texts = [content["evaluated"].get("warnings", []), [(content.get("stability") or {}).get("protocol", "")],
+             [(content.get("consistency_ap") or {}).get("ids", "")]]  # fmt: skip
+    if not all(isinstance(several, list) and all(isinstance(one, str | None) for one in several) for several in texts):
+        raise UserError(f"{path}: its warnings, protocol of stability and ids of consistency must be texts.")
     return content
+
+
+def _is_figure(value: Any) -> bool:
+    """Whether a value is a number or null; an integer that no figure reaches is neither."""
+    return value is None or isinstance(value, float) or (isinstance(value, int) and abs(value) < EXACT)
 
 
 def _check_same(paths: Sequence[Path], evaluations: Sequence[Mapping[str, Any]]) -> None:
@@ -194,7 +205,7 @@ def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
     notes = [] if scenes >= FEW_SCENES else [f"{few} only: the intervals are narrower than the truth"]
     if not _same_stability(evaluations):
         notes.append("the stability was measured by different protocols and is left out")
-    if len({content.get("consistency_ap", {}).get("ids") for content in evaluations}) > 1:
+    if len({(content.get("consistency_ap") or {}).get("ids") for content in evaluations}) > 1:
         notes.append("consistency: some methods have track ids of their own, for others they were formed afterwards")
     shared: dict[str, None] = {}
     for content in evaluations:
@@ -203,7 +214,7 @@ def _notes(evaluations: Sequence[Mapping[str, Any]], scenes: int) -> list[str]:
 
 
 def _same_stability(evaluations: Sequence[Mapping[str, Any]]) -> bool:
-    settings = [content.get("stability", {}) for content in evaluations]
+    settings = [content.get("stability") or {} for content in evaluations]
     return len({(each.get("protocol"), each.get("interval")) for each in settings}) == 1
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mapfusion import json_text
 from predmapnet import __version__
 from predmapnet.config import BevFormerConfig, PredMapNetConfig
 from predmapnet.errors import UserError
@@ -96,12 +97,12 @@ def export_graphs(checkpoint: Checkpoint, folder: Path, rows: int | None = None)
 def read_graph_folder(folder: Path) -> GraphFolder:
     """Read the description of exported graphs. Raises UserError where it is missing or damaged."""
     try:
-        about = json.loads((folder / ABOUT).read_bytes())
+        about = json_text.parse((folder / ABOUT).read_bytes())
         if about["format"] != FORMAT:
             raise UserError(f"{folder} holds graphs of format {about['format']}, not {FORMAT}. Export them again.")
         config = parse_config(json.dumps(about["configuration"]), str(folder / ABOUT))
         return GraphFolder(folder, config, int(about["rows"]), str(about["sha256"]), dict(about["facts"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise UserError(
             f"{folder} is no folder of exported graphs ({error}). Make one: predmapnet weights export --out FOLDER."
         ) from None

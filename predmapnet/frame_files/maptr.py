@@ -85,9 +85,13 @@ def _of_vectors(where: str, vectors: Any) -> dict[str, Any]:
             )
     return {
         "vectors": [vector["pts"] for vector in vectors],
-        "labels": [vector.get("cls_name", TYPES.get(vector.get("type"), vector.get("type"))) for vector in vectors],
+        "labels": [vector.get("cls_name", _named(vector.get("type"))) for vector in vectors],
         "scores": [vector["confidence_level"] for vector in vectors],
     }
+
+
+def _named(number: Any) -> Any:
+    return TYPES.get(number, number) if isinstance(number, int) else number
 
 
 def _ready(frame: SubmittedFrame, normalised: RegionOfInterest | None, y_forward: bool) -> SubmittedFrame:

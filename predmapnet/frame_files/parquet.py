@@ -37,8 +37,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from mapfusion import json_text
 from mapfusion.arrays import Float
 from mapfusion.elements import FrameMap, RegionOfInterest
+from predmapnet.arrow_tables import arrow_errors_told, open_parquet, parquet_rows
 from predmapnet.errors import UserError
 from predmapnet.files import write_file
 
@@ -136,8 +138,7 @@ def _flat(lines: Sequence[Float] | None) -> list[list[float]] | None:
 
 def stored_scenes(path: Path) -> tuple[str, ...]:
     """Names of the scenes in a Parquet file of per-frame results, in order of appearance. Raises UserError."""
-    table = _open_table(path, columns=["scene"])
-    return tuple(dict.fromkeys(table.column("scene").to_pylist()))
+    return tuple(dict.fromkeys(row["scene"] for row in parquet_rows(path, _opened(path), ["scene"])))
 
 
 def read_frames(path: Path, scene: str | None = None) -> StoredFrames:
@@ -150,10 +151,10 @@ def read_frames(path: Path, scene: str | None = None) -> StoredFrames:
     Raises:
         UserError: the file does not exist, is a pickle, is damaged, or has another schema or version.
     """
-    table = _open_table(path, filters=None if scene is None else [("scene", "=", scene)])
-    frames = tuple(_frame_of(path, row) for row in table.to_pylist())
+    file = _opened(path)
+    frames = tuple(_frame_of(path, row) for row in parquet_rows(path, file, scene=scene))
     try:
-        provenance = json.loads((table.schema.metadata or {}).get(_PROVENANCE_KEY, b"{}"))
+        provenance = json_text.parse((file.schema_arrow.metadata or {}).get(_PROVENANCE_KEY, b"{}"))
     except ValueError:
         provenance = None
     if not isinstance(provenance, dict):
@@ -172,30 +173,47 @@ def refuse_pickle(path: Path) -> None:
         )
 
 
-def _open_table(path: Path, **selection: Any) -> pa.Table:
-    """Read a selection of a file whose schema is ours."""
-    if not path.is_file():
-        raise UserError(f"There is no file {path}.")
-    refuse_pickle(path)
-    try:
-        schema = pq.read_schema(path)
-        _check_schema(path, schema)
-        return pq.read_table(path, **selection)
-    except (pa.ArrowException, OSError) as error:
-        raise UserError(f"{path} cannot be read as Parquet: {error}. Is it complete?") from error
+def _opened(path: Path) -> pq.ParquetFile:
+    """Open a file whose schema is ours."""
+    if path.is_file():
+        refuse_pickle(path)
+    file = open_parquet(path)
+    with arrow_errors_told(path, "Parquet"):
+        _check_schema(path, file.schema_arrow)
+    return file
 
 
 def _check_schema(path: Path, schema: pa.Schema) -> None:
-    version = (schema.metadata or {}).get(_VERSION_KEY, b"").decode()
+    version = (schema.metadata or {}).get(_VERSION_KEY, b"").decode(errors="backslashreplace")
     if version != str(SCHEMA_VERSION):
         found = f"version {version}" if version else "no version"
         raise UserError(
             f"{path} is no per-frame result that this program reads: it has {found} in its metadata, "
             f"version {SCHEMA_VERSION} is expected. Write it with 'predmapnet infer --save-frames'."
         )
-    missing = sorted(set(_SCHEMA.names) - {"visible", "ground_height"} - set(schema.names))
-    if missing:
-        raise UserError(f"{path} lacks the columns {', '.join(missing)}; write it again with --save-frames.")
+    optional = {"visible", "ground_height"} - set(schema.names)
+    wrong = [
+        field.name
+        for field in _SCHEMA
+        if field.name not in optional and (schema.names.count(field.name) != 1 or not _alike(schema, field))
+    ]
+    if wrong:
+        raise UserError(
+            f"{path} lacks the columns {', '.join(wrong)}, or holds something else in them; write it again with "
+            "--save-frames."
+        )
+
+
+def _alike(schema: pa.Schema, wanted: pa.Field) -> bool:
+    """Whether a column holds what it should: numbers of any width, texts, or lists of these."""
+    found, expected = schema.field(wanted.name).type, wanted.type
+    while pa.types.is_list(expected):
+        if not (pa.types.is_list(found) or pa.types.is_large_list(found)):
+            return False
+        found, expected = found.value_type, expected.value_type
+    if pa.types.is_string(expected):
+        return bool(pa.types.is_string(found) or pa.types.is_large_string(found))
+    return bool(pa.types.is_integer(found) or (pa.types.is_floating(found) and pa.types.is_floating(expected)))
 
 
 def _frame_of(path: Path, row: dict[str, Any]) -> StoredFrame:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mapfusion.arrays import Float
 from mapfusion.geometry import rigid_pose_problem
+from predmapnet.datasets.fields import numbers
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.datasets.plausibility import (
     NANOSECONDS,
@@ -126,7 +127,7 @@ def _check_drives(
 
 
 def _json_rows(path: Path) -> list[tuple[str, Mapping[str, Any]]]:
-    content = parse_json(path.read_bytes(), path)
+    content = parse_json(path.read_bytes(), path, unique=True)
     if isinstance(content, dict):
         content = [{"token": token, **pose} if isinstance(pose, dict) else pose for token, pose in content.items()]
     if not isinstance(content, list):
@@ -148,7 +149,7 @@ def _pose(where: str, row: Mapping[str, Any]) -> tuple[FramePose, bool]:
         matrix = _matrix(where, row)
     except KeyError as error:
         raise UserError(f"{where}: {error} is missing. {HOW}.") from error
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise UserError(f"{where}: {error}. {HOW}.") from error
     problem = rigid_pose_problem(matrix)
     if problem is not None:
@@ -159,7 +160,7 @@ def _pose(where: str, row: Mapping[str, Any]) -> tuple[FramePose, bool]:
 
 def _matrix(where: str, row: Mapping[str, Any]) -> Float:
     if "ego_to_global" in row:
-        matrix = np.array(row["ego_to_global"], dtype=np.float64)
+        matrix = numbers(row["ego_to_global"])
         if matrix.size != 16:
             raise ValueError(f"ego_to_global has {matrix.size} numbers instead of 16")
         return matrix.reshape(4, 4)

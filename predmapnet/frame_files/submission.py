@@ -15,7 +15,6 @@ with ``visible``, a list of rings, which are lists of points like vectors; a rin
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from numpy.typing import NDArray
 
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, FrameMap, RegionOfInterest
+from predmapnet.datasets.fields import EXACT, numbers
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
 from predmapnet.frame_files.parquet import refuse_pickle
@@ -141,22 +141,11 @@ def load_results(path: Path) -> Any:
     # Python's own writer puts NaN into files; it is read, so that the element that holds it can be named.
     content = parse_json(data, path)
     results = content.get("results") if isinstance(content, dict) else content
-    if isinstance(results, dict) and data.count(b'"vectors"') > len(results):
-        _refuse_repeated_names(data, path)
+    if isinstance(results, dict):
+        held = sum(len(entry) if isinstance(entry, list) else 1 for entry in results.values())
+        if data.count(b'"vectors"') + data.count(b'"pts"') > held:  # it may hold a frame twice
+            parse_json(data, path, unique=True)
     return results
-
-
-def _refuse_repeated_names(data: bytes, path: Path) -> None:
-    """Raise UserError for a JSON object that holds a name twice; readers take the last one and say nothing."""
-
-    def checked(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = Counter(name for name, _ in pairs)
-        repeated = [name for name, count in names.items() if count > 1]
-        if repeated:
-            raise UserError(f"{path} holds the frame (or key) {repeated[0]} twice.")
-        return dict(pairs)
-
-    json.loads(data.decode("utf-8-sig", errors="replace"), object_pairs_hook=checked)
 
 
 def is_maptr(results: Any) -> bool:
@@ -229,19 +218,20 @@ def _kinds(where: str, labels: Any) -> list[ElementKind | str]:
 
 def _numbers(where: str, values: Any, kind: type[np.generic]) -> NDArray[Any]:
     try:
-        numbers = np.array(values, dtype=np.float64).reshape(-1)
-        whole = numbers.astype(kind)
-    except (TypeError, ValueError) as error:
+        found = numbers(values)
+    except ValueError as error:
         raise UserError(f"{where} are not numbers: {error}.") from error
-    if kind is np.int64 and not (whole == numbers).all():
-        raise UserError(f"{where} are not all whole numbers: {numbers.tolist()[:5]}.")
-    return whole
+    if found.ndim != 1:
+        raise UserError(f"{where} are no list of numbers: {str(values)[:40]}.")
+    if kind is np.int64 and not ((np.abs(found) < EXACT) & (found == np.round(found))).all():
+        raise UserError(f"{where} are not all whole numbers: {found.tolist()[:5]}.")
+    return found.astype(kind)
 
 
 def _polyline(where: str, vector: Any) -> Float:
     try:
-        points = np.array(vector, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        points = numbers(vector)
+    except ValueError as error:
         raise UserError(f"{where} is not a list of points: {error}.") from error
     if points.ndim == 1 and points.size % 2 == 0:
         return points.reshape(-1, 2)

@@ -6,10 +6,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Literal
 
 import orjson
+from pydantic import BaseModel
 
+from mapfusion import json_text
 from predmapnet.files import file_name
 from predmapnet.runs.output_folder import OutputFolder
 
@@ -124,12 +126,43 @@ def _write(folder: OutputFolder, name: str, record: dict[str, Any]) -> None:
         temporary.write_bytes(orjson.dumps(record, option=orjson.OPT_INDENT_2))
 
 
+class _Accuracy(BaseModel):
+    mean_ap: float | None
+    precision: float | None
+    recall: float | None
+
+
+class _Report(BaseModel):
+    """What of a scene's report is read again."""
+
+    frames: int
+    seconds: float
+    frames_per_second: float
+    elements: dict[str, int]
+    metres: dict[str, float]
+    rejections: dict[str, int]
+    accuracy: _Accuracy | None = None
+    notes: list[str] = []
+
+
+class _Record(BaseModel):
+    scene: str
+    status: Literal["failed"] | None = None
+    seconds: float | None = None
+    report: _Report | None = None
+    error: str | None = None
+    reason: str | None = None
+    trace: str | None = None
+
+
 def _parsed(content: bytes) -> dict[str, Any] | None:
+    """Return a record as it was written; None for what is none, since other programs write summaries, too."""
     try:
-        record = orjson.loads(content)
-    except orjson.JSONDecodeError:
+        record = json_text.parse(content)
+        found = _Record.model_validate(record, strict=True)
+    except ValueError:
         return None
-    return record if isinstance(record, dict) and "scene" in record else None
+    return record if found.report is not None or found.status is not None else None
 
 
 def _outcome(record: dict[str, Any]) -> Outcome:

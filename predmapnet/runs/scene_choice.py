@@ -87,19 +87,17 @@ def _csv_rows(path: Path) -> list[tuple[str, str]]:
 
 
 def _parquet_rows(path: Path) -> list[tuple[str, str]]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from predmapnet.arrow_tables import open_parquet, parquet_rows
 
-    try:
-        table = pq.read_table(path)
-    except pa.ArrowInvalid as error:
-        raise UserError(f"{path} is no Parquet file: {error}") from error
-    _check_columns(path, table.column_names)
-    rows = table.select(["scene", "folder"]).to_pylist()
-    return [(str(row["scene"] or ""), str(row["folder"] or "")) for row in rows]
+    file = open_parquet(path)
+    _check_columns(path, file.schema_arrow.names)
+    rows = parquet_rows(path, file, ["scene", "folder"])
+    return [(str(row["scene"] or "").strip(), str(row["folder"] or "").strip()) for row in rows]
 
 
 def _check_columns(path: Path, names: Sequence[str]) -> None:
-    missing = [name for name in ("scene", "folder") if name not in names]
+    missing = [name for name in ("scene", "folder") if names.count(name) != 1]
     if missing:
-        raise UserError(f"{path} has no column {' or '.join(missing)}; a manifest has the columns scene and folder")
+        raise UserError(
+            f"{path} has no column {' or '.join(missing)}, or has it twice; a manifest has the columns scene and folder"
+        )

@@ -183,10 +183,11 @@ class Trainer:
         torch.manual_seed(crc32(repr((seed, rank)).encode()))
         if resumed and self._stored is not None:
             tensors = run_checkpoint.read_tensors(self._stored, "network")
-            run_checkpoint.restore_optimiser(optimiser, below_prefix("optimiser", tensors))
             own = run_checkpoint.read_tensors(self._stored, f"rank-{rank}")
-            run_checkpoint.restore_random_states(own, device)
-            training.restore(own)
+            with run_checkpoint.misfit_told(self._stored):
+                run_checkpoint.restore_optimiser(optimiser, below_prefix("optimiser", tensors))
+                run_checkpoint.restore_random_states(own, device)
+                training.restore(own)
             self._report(f"Stage {stage.name}: goes on at step {position.step}, frame {position.frames}.")
         return training, optimiser
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import orjson
 import torch
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -39,6 +41,8 @@ class Position:
         data: what the stage sees.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     stage: str = ""
     step: int = 0
     fall: list[int] = field(default_factory=list)
@@ -58,6 +62,9 @@ class Position:
         self.total_seconds += self.seconds
         self.stage, self.step, self.validated, self.average_updates = stage, 0, 0, 0
         self.seconds, self.fall = 0.0, []
+
+
+_POSITION = TypeAdapter(Position)
 
 
 def partial_folder(folder: Path, position: Position) -> Path:
@@ -92,9 +99,12 @@ def to_resume(folder: Path) -> Path:
 def read_position(checkpoint: Path) -> Position:
     """Read where a run stood. Raises UserError if that is damaged."""
     try:
-        return Position(**orjson.loads((checkpoint / "position.json").read_bytes()))
-    except (OSError, TypeError, orjson.JSONDecodeError) as error:
+        position = _POSITION.validate_json((checkpoint / "position.json").read_bytes())
+    except (OSError, ValidationError) as error:
         raise UserError(f"The checkpoint {checkpoint} is damaged or of another version: {error}.") from None
+    if min(position.step, position.frames, position.validated, position.metrics_bytes, *position.fall) < 0:
+        raise UserError(f"The checkpoint {checkpoint} is damaged: its position.json counts below zero.")
+    return position
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -108,6 +118,15 @@ def read_tensors(checkpoint: Path, part: str) -> dict[str, Tensor]:
         return load_file(checkpoint / f"{part}.safetensors")
     except Exception as error:
         raise UserError(f"The checkpoint {checkpoint} is damaged: {part} cannot be read ({error}).") from None
+
+
+@contextmanager
+def misfit_told(checkpoint: Path) -> Iterator[None]:
+    """Raise as UserErrors what goes wrong while tensors are put back that do not belong there."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise UserError(f"The checkpoint {checkpoint} is damaged or of another network: {error}.") from None
 
 
 def with_prefix(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

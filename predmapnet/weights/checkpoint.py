@@ -21,7 +21,8 @@ from predmapnet.errors import UserError
 from predmapnet.files import write_file
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import parse_config
-from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
+from predmapnet.weights.files import KEY, description, existing_weights, unreadable, weights_hash
+from predmapnet.weights.fit import is_finite
 
 FORMAT = 1
 _SHOWN_NAMES = 4
@@ -79,29 +80,37 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     path = existing_weights(path)
     try:
         with safe_open(path, framework="pt") as file:
-            about = json.loads((file.metadata() or {}).get(KEY, "{}"))
+            about = description(file.metadata())
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise unreadable(path, error) from None
     if about.get("format") != FORMAT:
         raise UserError(
             f"{path} does not hold PredMapNet weights of format {FORMAT} (it says: {about.get('format')}). "
             "Weights of other programs have to be imported first."
         )
-    network = PredMapNet(parse_config(json.dumps(about["configuration"]), str(path)))
-    _check_fit({name: tensor.shape for name, tensor in tensors.items()}, network, path)
+    config = parse_config(json.dumps(about.get("configuration")), str(path))
+    facts = about.get("facts")
+    if not isinstance(facts, dict):
+        raise UserError(f"{path}: its description has no object 'facts', but {str(facts)[:40]}.")
+    with torch.device("meta"):  # what does not fit the weights may be of any size
+        skeleton = PredMapNet(config)
+    _check_fit(tensors, skeleton, path)
+    network = PredMapNet(config)
     network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
     network.eval()
-    return Checkpoint(network, about["facts"], about["version"], weights_hash(path))
+    return Checkpoint(network, facts, str(about.get("version")), weights_hash(path))
 
 
 def _full(tensor: torch.Tensor) -> torch.Tensor:
     return tensor.float() if tensor.is_floating_point() else tensor
 
 
-def _check_fit(shapes: Mapping[str, torch.Size], network: PredMapNet, path: Path) -> None:
-    """Compare names and shapes with the network's, and name what does not fit."""
-    wanted = {name: tensor.shape for name, tensor in network.state_dict().items()}
+def _check_fit(tensors: Mapping[str, torch.Tensor], network: PredMapNet, path: Path) -> None:
+    """Compare names and shapes with the network's, and name what does not fit, or holds no numbers."""
+    own = network.state_dict()
+    wanted = {name: tensor.shape for name, tensor in own.items()}
+    shapes = {name: tensor.shape for name, tensor in tensors.items()}
     faults = {
         "missing": [name for name in wanted if name not in shapes],
         "not known": [name for name in shapes if name not in wanted],
@@ -110,6 +119,12 @@ def _check_fit(shapes: Mapping[str, torch.Size], network: PredMapNet, path: Path
             for name, shape in wanted.items()
             if name in shapes and shapes[name] != shape
         ],
+        "of another kind": [
+            f"{name} {tensor.dtype}"
+            for name, tensor in tensors.items()
+            if name in own and tensor.is_floating_point() != own[name].is_floating_point()
+        ],
+        "with NaN or infinity": [name for name, tensor in tensors.items() if not is_finite(tensor)],
     }
     said = [
         f"{len(names)} {what}: {', '.join(names[:_SHOWN_NAMES])}{' ...' if len(names) > _SHOWN_NAMES else ''}"

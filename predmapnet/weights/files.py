@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
+from mapfusion import json_text
 from predmapnet.errors import UserError
 
 SHIPPED = Path(__file__).with_name("lite.safetensors")
@@ -41,6 +44,17 @@ def weights_hash(path: Path | None = None) -> str:
     path = existing_weights(path)
     stamp = path.stat()
     return _hash(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+def description(metadata: Mapping[str, str] | None) -> dict[str, Any]:
+    """Return what PredMapNet's metadata of a safetensors file say; nothing for those of another program.
+
+    Raises ValueError for metadata that are not as they were written.
+    """
+    about = json_text.parse((metadata or {}).get(KEY, "{}").encode())
+    if not isinstance(about, dict):
+        raise ValueError(f"its description is no JSON object, but {str(about)[:40]}")
+    return about
 
 
 def unreadable(path: Path, error: Exception) -> UserError:

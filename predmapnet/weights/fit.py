@@ -12,6 +12,11 @@ from predmapnet.errors import UserError
 _SHOWN_NAMES = 4
 
 
+def is_finite(tensor: Tensor) -> bool:
+    """Whether no number of a tensor is NaN or infinite."""
+    return bool(tensor.float().isfinite().all()) if tensor.is_floating_point() else True
+
+
 def check_fit(network: nn.Module, tensors: Mapping[str, Tensor], where: Path) -> list[str]:
     """Compare weights with the network that they are for; only names and shapes are looked at.
 

@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 
 from predmapnet.errors import UserError
 from predmapnet.presets import parse_config
-from predmapnet.weights.files import KEY, existing_weights, unreadable, weights_hash
+from predmapnet.weights.files import description, existing_weights, unreadable, weights_hash
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,11 @@ def inspect_file(path: Path | None = None) -> WeightsInfo:
     path = existing_weights(path)
     try:
         with safe_open(path, framework="numpy") as file:
-            about = json.loads((file.metadata() or {}).get(KEY, "{}"))
+            about = description(file.metadata())
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
             tensors = tuple(
                 TensorInfo(name, tuple(part.get_shape()), part.get_dtype()) for name, part in sorted(slices.items())
             )
-    except (SafetensorError, OSError, json.JSONDecodeError) as error:
+    except (SafetensorError, OSError, ValueError) as error:
         raise unreadable(path, error) from None
     return WeightsInfo(path, path.stat().st_size, about, tensors, weights_hash(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import PRESETS, preset
+from predmapnet.weights.fit import is_finite
 from predmapnet.weights.maptracker_names import name_here, original_of_alias
 
 BEGINNINGS = (b"PK", b"\x80\x02", b"\x80\x04", b"\x80\x05")
@@ -71,18 +73,40 @@ def read_official_checkpoint(path: Path) -> dict[str, Tensor]:
     """
     if not path.is_file():
         raise UserError(f"There is no file {path}.")
+    _check_packing(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         if _beginning(path) in BEGINNINGS:
             raise UserError(_not_only_tensors(path)) from None
         raise UserError(f"{path} is not a whole PyTorch checkpoint. Fetch it again.") from None
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    except Exception as error:  # a damaged file may raise anything while its objects are put together
         raise UserError(f"{path} is not a whole PyTorch checkpoint ({_first_line(error)}). Fetch it again.") from None
     state = content.get("state_dict", content) if isinstance(content, Mapping) else None
     if not isinstance(state, Mapping) or not state or not all(isinstance(value, Tensor) for value in state.values()):
         raise UserError(f"{path} holds no state dict: a mapping from names to tensors, or one under 'state_dict'.")
+    odd = [str(name) for name, value in state.items() if not _is_plain(value)]
+    if odd:
+        raise UserError(f"{path}: not plain tensors of finite numbers: {_some(odd)}.")
     return {str(name).removeprefix("module."): value for name, value in state.items()}
+
+
+def _check_packing(path: Path) -> None:
+    """Raise UserError for an archive whose members would fill the memory; torch packs none of them."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+    except (zipfile.BadZipFile, ValueError, NotImplementedError):
+        return  # the former layout, or damaged, which torch tells
+    if unpacked > 4 * path.stat().st_size + (1 << 20):
+        raise UserError(f"{path} holds {unpacked:,} bytes packed into far fewer, as torch does not write them.")
+
+
+def _is_plain(value: Tensor) -> bool:
+    """Whether a tensor is one of numbers that are all in the file; one that is stretched may be of any size."""
+    plain = value.layout is torch.strided and value.device.type == "cpu" and not value.is_quantized
+    stored = plain and value.numel() * value.element_size() <= value.untyped_storage().nbytes()
+    return stored and not value.is_complex() and is_finite(value)
 
 
 def import_maptracker(
@@ -137,7 +161,7 @@ def _configuration(
     official: Mapping[str, Tensor], found: Mapping[str, Tensor], config: PredMapNetConfig | None
 ) -> PredMapNetConfig:
     """Return the configuration that was asked for, or the baseline's for as many cameras; with the file's region."""
-    cameras = len(found.get(CAMERA_CODE, ()))
+    cameras = found[CAMERA_CODE].shape[0] if CAMERA_CODE in found and found[CAMERA_CODE].ndim else 0
     if config is None:
         config = BASELINES.get(cameras, BASELINES[len(NUSCENES_CAMERAS)])
     if not isinstance(config.bev, BevFormerConfig) or not isinstance(config.decoder, MapTrackerDecoderConfig):

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from predmapnet.datasets.images import check_jpeg
+from predmapnet.datasets.images import image_size
 from predmapnet.errors import UserError
 
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
@@ -71,11 +71,9 @@ def _compressed(data: bytes, stated: str) -> tuple[bytes, str]:
     mosaic = stated.startswith("bayer") and "compressed bgr8" not in stated and "compressed rgb8" not in stated
     if mosaic or "compressedDepth" in stated or stated.startswith(("16UC1", "32FC1")):
         raise UserError(f"its images are '{stated}', no pictures in colours or grey")
-    if data[:2] == JPEG:
-        check_jpeg(data, "the image")
-        return data, ".jpg"
-    if data[:4] == PNG:
-        return data, ".png"
+    if data[:2] == JPEG or data[:4] == PNG:
+        image_size(data, "the image")
+        return data, ".jpg" if data[:2] == JPEG else ".png"
     raise UserError(f"its images are '{stated}', neither JPEG nor PNG; republish them so (image_transport)")
 
 

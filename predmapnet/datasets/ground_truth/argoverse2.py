@@ -15,7 +15,7 @@ from shapely import LineString, Polygon, STRtree
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
-from mapfusion.geometry import inverse_pose
+from mapfusion.geometry import FARTHEST_POSE, inverse_pose
 from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA
 from predmapnet.datasets.ground_truth.lane_dividers import (
     LaneSide,
@@ -29,7 +29,7 @@ from predmapnet.datasets.ground_truth.lane_dividers import (
     without_shared,
     without_twins,
 )
-from predmapnet.datasets.ground_truth.map_file import read_map_file
+from predmapnet.datasets.ground_truth.map_file import MALFORMED, read_map_file
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     area_rings,
@@ -73,7 +73,7 @@ class Argoverse2GroundTruth:
             self._index_lanes(lanes)
             self._crossings = np.array([Polygon(points) for points in crossings], dtype=object)
             drivable = np.array([Polygon(points) for points in areas], dtype=object)
-        except (KeyError, IndexError, TypeError, AttributeError, ValueError, shapely.GEOSException) as error:
+        except MALFORMED as error:
             raise UserError(
                 f"{name} is not an Argoverse 2 vector map ({type(error).__name__}: {error}). Fetch the log again."
             ) from None
@@ -192,7 +192,9 @@ class Argoverse2GroundTruth:
 
         Dividers along a boundary are left out.
         """
-        crossings, _ = parts_of_type(shapely.intersection(shapely.force_2d(self._crossings), area), "Polygon")
+        crossings, _ = parts_of_type(
+            shapely.intersection(shapely.make_valid(shapely.force_2d(self._crossings)), area), "Polygon"
+        )
         lines, _ = parts_of_type(
             shapely.intersection([LineString(line) for line in self.divider_lines], area), "LineString"
         )
@@ -239,8 +241,8 @@ def _points(records: Sequence[Mapping[str, float]]) -> Float:
     heights = np.isfinite(points[:, 2])
     if not heights.all():
         points[~heights, 2] = points[heights, 2].mean() if heights.any() else 0.0
-    if not np.isfinite(points).all():
-        raise ValueError("a point is not finite")
+    if not (np.abs(points) <= FARTHEST_POSE).all():
+        raise ValueError(f"a point is not finite, or more than {FARTHEST_POSE:g} m away")
     return points
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -21,6 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from mapfusion import geometry
+from mapfusion.array_files import read_arrays
 from mapfusion.arrays import Float
 from mapfusion.elements import RegionOfInterest
 from mapfusion.files import write_whole
@@ -89,8 +88,8 @@ def cached_truths(folder: Path, key: str, compute: Callable[[], Sequence[FrameTr
     A damaged file is computed and written anew; a folder that cannot be written to raises UserError.
     """
     path = folder / f"truth-{key}.npz"
-    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-        return _load(path)
+    with contextlib.suppress(OSError, ValueError):
+        return truths_of_arrays(read_arrays(path))
     truths = list(compute())
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -116,22 +115,23 @@ def truth_arrays(truths: Sequence[FrameTruth]) -> dict[str, NDArray[np.generic]]
 
 
 def truths_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> list[FrameTruth]:
-    """Return what :func:`truth_arrays` was given. Raises KeyError or ValueError for arrays of another kind."""
-    lengths, points = arrays["lengths"], arrays["points"]
-    kinds, element_ids = arrays["kinds"], arrays["element_ids"]
+    """Return what :func:`truth_arrays` was given. Raises ValueError for arrays of another kind."""
+    kinds_of_arrays = {"lengths": "i", "points": "f", "kinds": "i", "element_ids": "i", "counts": "i"}
+    found = [arrays.get(name, np.zeros(0, dtype=bool)) for name in kinds_of_arrays]
+    if [array.dtype.kind for array in found] != [*kinds_of_arrays.values()]:
+        raise ValueError(f"arrays {', '.join(kinds_of_arrays)} are expected")
+    lengths, points, kinds, element_ids, counts = found
+    whole = len(lengths) == len(kinds) == len(element_ids) == counts.sum() and lengths.sum() == len(points)
+    if not whole or points.shape != (len(points), 2) or (lengths < 0).any() or (counts < 0).any():
+        raise ValueError("the arrays do not fit each other")
     lines = np.split(points, np.cumsum(lengths)[:-1]) if len(lengths) else []
-    ends = np.cumsum(arrays["counts"])
+    ends = np.cumsum(counts)
     return [
         FrameTruth(kinds[end - count : end], tuple(lines[end - count : end]), element_ids[end - count : end])
-        for count, end in zip(arrays["counts"].tolist(), ends.tolist(), strict=True)
+        for count, end in zip(counts.tolist(), ends.tolist(), strict=True)
     ]
 
 
 def _save(path: Path, truths: Sequence[FrameTruth]) -> None:
     with write_whole(path) as temporary:
         np.savez_compressed(temporary, **truth_arrays(truths))  # type: ignore[arg-type]
-
-
-def _load(path: Path) -> list[FrameTruth]:
-    with np.load(path, allow_pickle=False) as stored:
-        return truths_of_arrays({name: stored[name] for name in stored.files})

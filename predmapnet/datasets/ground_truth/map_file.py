@@ -8,9 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import orjson
+import shapely
 
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
+
+MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, shapely.GEOSException)
+"""What a reader trips over where a map is not as it should be."""
 
 
 def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:

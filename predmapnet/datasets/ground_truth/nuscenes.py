@@ -16,9 +16,9 @@ from shapely import LineString, Polygon, STRtree
 
 from mapfusion.arrays import Float
 from mapfusion.elements import ElementKind, RegionOfInterest
-from mapfusion.geometry import rotation_of_quaternion
+from mapfusion.geometry import FARTHEST_POSE, rotation_of_quaternion
 from predmapnet.datasets.ground_truth.crossings import MINIMUM_AREA, merge_crossings
-from predmapnet.datasets.ground_truth.map_file import read_map_file
+from predmapnet.datasets.ground_truth.map_file import MALFORMED, read_map_file
 from predmapnet.datasets.ground_truth.patch import (
     BORDER,
     apply,
@@ -81,7 +81,7 @@ class NuScenesGroundTruth:
                 road_segments=_polygons(content["road_segment"], polygons, nodes),
                 lanes=_polygons(content["lane"], polygons, nodes),
             )
-        except (KeyError, TypeError, AttributeError, IndexError, shapely.GEOSException, ValueError) as error:
+        except MALFORMED as error:
             raise UserError(
                 f"{name} is not a nuScenes map expansion of version 1.3 ({type(error).__name__}: {error}). "
                 "Fetch the map expansion again and unpack it into maps/expansion."
@@ -274,8 +274,8 @@ def _polygons(
 
 def _position(node: Mapping[str, Any]) -> tuple[float, float]:
     x, y = float(node["x"]), float(node["y"])
-    if not (math.isfinite(x) and math.isfinite(y)):
-        raise ValueError(f"the node {node['token']} is not finite")
+    if not (abs(x) <= FARTHEST_POSE and abs(y) <= FARTHEST_POSE):
+        raise ValueError(f"the node {node['token']} is not finite, or more than {FARTHEST_POSE:g} m away")
     return x, y
 
 

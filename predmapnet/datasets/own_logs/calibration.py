@@ -57,7 +57,7 @@ def read_calibration(path: Path) -> LogCalibration:
     """
     if not path.is_file():
         raise UserError(f"There is no {path}: it describes the cameras of the log (docs/own-logs.md).")
-    content = parse_json(path.read_bytes(), path)
+    content = parse_json(path.read_bytes(), path, unique=True)
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(cameras, dict) or not cameras or not all(isinstance(entry, dict) for entry in cameras.values()):
         raise UserError(f"{path}: an object 'cameras' is expected, which describes each camera by name.")

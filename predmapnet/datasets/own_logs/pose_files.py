@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ MOVED = 3.0
 """Shorter ways up and down may be noise, metres."""
 FARTHEST = 1e8
 """No frame of a car has its origin farther off, metres."""
-WHOLE_NANOSECONDS = 10**15
-"""Times of TUM and KITTI are seconds; whole numbers from here on can only be nanoseconds."""
+WHOLE_NANOSECONDS = re.compile("[0-9]{16,}")
+"""Times of TUM and KITTI are seconds; whole numbers as long as this can only be nanoseconds."""
 
 Rows = Sequence[tuple[str, Mapping[str, Any]]]
 """Place in the file, and the time, ``translation`` and ``rotation`` (w, x, y, z) of each pose."""
@@ -160,7 +161,7 @@ def _numbers(words: list[str], where: str) -> list[float]:
 
 
 def _unit(time: str) -> str:
-    return "timestamp_ns" if time.isdigit() and int(time) >= WHOLE_NANOSECONDS else "timestamp_s"
+    return "timestamp_ns" if WHOLE_NANOSECONDS.fullmatch(time) else "timestamp_s"
 
 
 def _time(row: Mapping[str, Any], where: str) -> int:

@@ -177,7 +177,7 @@ def _georeference(path: Path) -> LocalPlane | None:
     """Read where the origin of the poses lies; x is east, y is north. None where there is no file."""
     if not path.is_file():
         return None
-    content = parse_json(path.read_bytes(), path)
+    content = parse_json(path.read_bytes(), path, unique=True)
     record = content if isinstance(content, dict) else {}
     latitude, longitude = (float(numbers_field(record, name, (), str(path))) for name in ("latitude", "longitude"))
     place = f"{path}: latitude {latitude:g}, longitude {longitude:g}"

@@ -11,8 +11,10 @@ import shapely
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import ElementKind, GlobalMap, MapElement, RegionOfInterest
 from mapfusion.formats.by_suffix import read_map
+from mapfusion.geometry import FARTHEST_POSE
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import region
+from predmapnet.datasets.fields import numbers
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError, value_errors_told
 from predmapnet.scenes import FrameTruth
@@ -47,23 +49,25 @@ def read_truth(folder: Path, georeference: InvertibleGeoreference) -> Lines | No
 def _read_json(path: Path) -> Lines:
     """Read lines in metres of the global frame: ``{"elements": [{"kind": "divider", "points": [[x, y], ...]}]}``."""
     kinds = {kind.label: kind for kind in ElementKind}
-    content = parse_json(path.read_bytes(), path)
+    content = parse_json(path.read_bytes(), path, unique=True)
     elements = content.get("elements") if isinstance(content, dict) else None
     if not isinstance(elements, list):
         raise UserError(f"{path}: an object with a list 'elements' is expected.")
     found = []
     for number, element in enumerate(elements):
-        kind = kinds.get(element.get("kind", "")) if isinstance(element, dict) else None
+        kind = kinds.get(str(element.get("kind"))) if isinstance(element, dict) else None
         try:
-            points = np.array(element["points"] if kind is not None else None, dtype=np.float64)
-        except (KeyError, TypeError, ValueError):
+            points = numbers(element.get("points") if kind is not None else None)
+        except ValueError:
             points = np.zeros(0)
         if kind is None or points.ndim != 2 or len(points) < 2 or points.shape[1] not in (2, 3):
             raise UserError(
                 f"{path}, element {number}: a 'kind' ({', '.join(kinds)}) and 'points' [x, y] are expected."
             )
-        if not np.isfinite(points).all():
-            raise UserError(f"{path}, element {number}: the points must be finite numbers.")
+        if not (np.abs(points) <= FARTHEST_POSE).all():
+            raise UserError(
+                f"{path}, element {number}: the points must be finite numbers, metres, at most {FARTHEST_POSE:g}."
+            )
         closed = np.concatenate([points, points[:1]]) if kind.is_ring and (points[0] != points[-1]).any() else points
         found.append((kind, closed[:, :2]))
     return found

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.array_files import read_arrays
 from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.datasets.images import read_image
@@ -32,7 +33,6 @@ from predmapnet.training.data.scene_cache import (
     encoded_images,
     frame_arrays,
     frame_path,
-    read_arrays,
     write_arrays,
 )
 from predmapnet.training.settings import Report
@@ -123,7 +123,7 @@ def cache_frame(
     origin, problems = _origin(frame, arrays), list[str]()
     try:
         stored = read_arrays(path)
-    except UserError:
+    except (OSError, ValueError):
         stored = {}
     made = not np.array_equal(stored.get("origin", ()), origin)
     if made:

@@ -6,20 +6,20 @@ pose, calibration, truth and depth, each with a checksum; ``index.npz`` is writt
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mapfusion.array_files import read_arrays
 from mapfusion.arrays import Float
 from predmapnet.datasets.ground_truth.cache import truth_arrays, truths_of_arrays
 from predmapnet.errors import UserError
@@ -79,18 +79,12 @@ def write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         np.savez(temporary, **arrays)  # type: ignore[arg-type]
 
 
-def read_arrays(path: Path, without: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file, all but some. Raises UserError for one that is missing or damaged."""
-    with _opened(path) as stored:
-        return {name: stored[name] for name in stored.files if name not in without}
-
-
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def damage_told(path: Path) -> Iterator[None]:
+    """Raise as a UserError what a reader trips over in a file that is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            yield stored
-    except (OSError, ValueError, EOFError, NotImplementedError, zlib.error, BadZipFile) as error:
+        yield
+    except (OSError, ValueError, KeyError, IndexError, TypeError, BadZipFile, cv2.error) as error:
         raise UserError(f"{path} of the training cache is damaged ({error}). Train again: it is made anew.") from None
 
 
@@ -105,9 +99,11 @@ class CachedScene:
 
     def __init__(self, folder: Path) -> None:
         """Open a scene. Raises UserError where it is not there or not complete."""
-        index = read_arrays(folder / INDEX)
         self.folder, self.name = folder, folder.name
-        self.with_crossing, self._numbers = index["with_crossing"], index["numbers"]
+        with damage_told(folder / INDEX):
+            index = read_arrays(folder / INDEX)
+            self.with_crossing = index["with_crossing"].astype(np.bool_)
+            self._numbers = index["numbers"].astype(np.int64).reshape(len(self.with_crossing))
 
     def __len__(self) -> int:
         return len(self._numbers)
@@ -116,24 +112,27 @@ class CachedScene:
         """Tell the frames of this scene from all others. Raises UserError where one is missing or damaged."""
         found = sha256()
         for number in self._numbers.tolist():
-            with _opened(frame_path(self.folder, number)) as stored:
-                found.update(repr([(member.filename, member.CRC) for member in stored.zip.infolist()]).encode())
+            path = frame_path(self.folder, number)
+            with damage_told(path), ZipFile(path) as archive:
+                found.update(repr([(member.filename, member.CRC) for member in archive.infolist()]).encode())
         return found.hexdigest()[:20]
 
     def frame(self, index: int, images: bool = True) -> CachedFrame:
         """Read one frame, its images (and its depth) only where they are asked for. Raises UserError for damage."""
         path = frame_path(self.folder, int(self._numbers[index]))
-        arrays = read_arrays(path, without=("origin",) if images else ("origin", "images", "camera_valid", "depth"))
-        pixels, valid = np.zeros((0, 0, 0, 3), np.uint8), np.zeros(0, np.bool_)
-        if images:
-            stacked = np.asarray(cv2.imdecode(arrays["images"], cv2.IMREAD_COLOR_RGB), np.uint8)
-            valid = arrays["camera_valid"]
-            pixels = stacked.reshape(len(valid), -1, *stacked.shape[1:])
-        return CachedFrame(
-            ego_to_global=arrays["ego_to_global"],
-            calibration=Calibration(**{each.name: torch.from_numpy(arrays[each.name]) for each in fields(Calibration)}),
-            truth=truths_of_arrays(arrays)[0],
-            images=pixels,
-            camera_valid=valid,
-            depth=arrays["depth"].astype(np.int64) if "depth" in arrays else None,
-        )
+        with damage_told(path):
+            arrays = read_arrays(path, without=("origin",) if images else ("origin", "images", "camera_valid", "depth"))
+            pixels, valid = np.zeros((0, 0, 0, 3), np.uint8), np.zeros(0, np.bool_)
+            if images:
+                stacked = np.asarray(cv2.imdecode(arrays["images"], cv2.IMREAD_COLOR_RGB), np.uint8)
+                valid = arrays["camera_valid"]
+                pixels = stacked.reshape(len(valid), -1, *stacked.shape[1:])
+            calibration = {each.name: torch.from_numpy(arrays[each.name]) for each in fields(Calibration)}
+            return CachedFrame(
+                ego_to_global=arrays["ego_to_global"],
+                calibration=Calibration(**calibration),
+                truth=truths_of_arrays(arrays)[0],
+                images=pixels,
+                camera_valid=valid,
+                depth=arrays["depth"].astype(np.int64) if "depth" in arrays else None,
+            )

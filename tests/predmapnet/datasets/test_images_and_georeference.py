@@ -1,6 +1,7 @@
 """Damaged images are noticed; metres become the right longitude and latitude."""
 
 import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -49,7 +50,7 @@ def test_what_is_no_image_is_named(tmp_path):
     with pytest.raises(UserError, match="Cannot read the image"):
         read_image(path)
     path.write_text("not found")
-    with pytest.raises(UserError, match="not an image that can be decoded"):
+    with pytest.raises(UserError, match="neither a JPEG nor a PNG"):
         read_image(path)
 
 
@@ -148,3 +149,60 @@ def test_points_of_another_frame_are_refused(georeference):
 def test_an_origin_that_is_no_place_is_refused(text):
     with pytest.raises(UserError, match="--origin"):
         given_origin(text)
+
+
+def png_with(content, change):
+    """A PNG whose chunks were changed, with checksums that fit."""
+    chunks, at = [], 8
+    while at < len(content):
+        length = int.from_bytes(content[at : at + 4])
+        chunks.append([content[at + 4 : at + 8], content[at + 8 : at + 8 + length]])
+        at += 12 + length
+    change(chunks)
+    parts = (len(data).to_bytes(4) + name + data + zlib.crc32(name + data).to_bytes(4) for name, data in chunks)
+    return content[:8] + b"".join(parts)
+
+
+@pytest.fixture
+def pictures():
+    """One picture as baseline JPEG, progressive JPEG and PNG."""
+    image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    return [
+        cv2.imencode(ending, image, options)[1].tobytes()
+        for ending, options in ((".jpg", []), (".jpg", [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]), (".png", []))
+    ]
+
+
+@pytest.mark.parametrize("kind", range(3))
+def test_a_picture_that_is_damaged_or_cut_short_anywhere_is_refused(tmp_path, pictures, kind):
+    path, data = tmp_path / "image.jpg", pictures[kind]
+    path.write_bytes(data + b"what some cameras write after the end")
+    assert read_image(path).shape == (48, 64, 3)
+    for share in (0.1, 0.5, 0.98):
+        at = int(len(data) * share)
+        path.write_bytes(data[:at])
+        with pytest.raises(UserError, match="cut short"):
+            read_image(path)
+    path.write_bytes(data[:at] + b"\xff\x05" + data[at + 2 :])
+    with pytest.raises(UserError, match="damaged"):
+        read_image(path)
+
+
+def test_a_header_that_would_fill_the_memory_is_refused(tmp_path, pictures):
+    path = tmp_path / "image.png"
+    huge = struct.pack(">II", 60_000, 60_000)
+    path.write_bytes(png_with(pictures[2], lambda chunks: chunks[0].__setitem__(1, huge + chunks[0][1][8:])))
+    with pytest.raises(UserError, match="60000 x 60000 pixels, as no camera has"):
+        read_image(path)
+    for jpeg, marker in ((pictures[0], b"\xff\xc0"), (pictures[1], b"\xff\xc2")):
+        at = jpeg.index(marker) + 5
+        path.write_bytes(jpeg[:at] + struct.pack(">HH", 60_000, 60_000) + jpeg[at + 4 :])
+        with pytest.raises(UserError, match="60000 x 60000 pixels"):
+            read_image(path)
+
+
+def test_other_formats_are_no_images_of_cameras_whatever_their_name(tmp_path):
+    path = tmp_path / "image.jpg"
+    path.write_bytes(cv2.imencode(".webp", np.zeros((48, 64, 3), dtype=np.uint8))[1].tobytes())
+    with pytest.raises(UserError, match="neither a JPEG nor a PNG"):
+        read_image(path)

@@ -47,5 +47,5 @@ def test_broken_manifests_are_told_with_their_row(tmp_path, content, told):
     with pytest.raises(UserError, match=told):
         read_manifest(tmp_path / "list.csv")
     (tmp_path / "list.parquet").write_bytes(content)
-    with pytest.raises(UserError, match="no Parquet"):
+    with pytest.raises(UserError, match="cannot be read as Parquet"):
         read_manifest(tmp_path / "list.parquet")

@@ -68,6 +68,15 @@ def test_the_same_network_gives_the_same_bytes(network, saved, tmp_path):
         (lambda t, _: t.update({"query_generator.content": torch.zeros(7, 128)}), "(7, 128) instead of (40, 128)"),
         (lambda _, about: about.update(format="other"), "does not hold PredMapNet weights"),
         (lambda _, about: about.update(configuration={"wings": 2}), "wings"),
+        (lambda _, about: about.pop("configuration"), "configuration"),
+        (lambda _, about: about.update(facts=[]), "no object 'facts'"),
+        (lambda _, about: about["configuration"]["decoder"].update(queries=60_000), "instead of (60000, 128)"),
+        (lambda _, about: about["configuration"]["decoder"].update(layers=10**9), "decoder.layers"),
+        (
+            lambda t, _: t["query_generator.content"].fill_(float("nan")),
+            "1 with NaN or infinity: query_generator.content",
+        ),
+        (lambda t, _: t.update({"query_generator.content": torch.zeros(40, 128).long()}), "1 of another kind"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(change, words, saved):

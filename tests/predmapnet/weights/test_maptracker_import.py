@@ -2,6 +2,7 @@
 
 import math
 import pickle
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -185,6 +186,33 @@ def test_damaged_files_are_named(tmp_path, content):
     path = tmp_path / "broken.pth"
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"broken\.pth is not a whole PyTorch checkpoint"):
+        read_official_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        torch.zeros(1).expand(100_000, 100_000),
+        torch.sparse_coo_tensor(torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0), (100_000, 100_000)),
+        torch.zeros(3, dtype=torch.complex64),
+        torch.tensor([float("inf")]),
+    ],
+)
+def test_tensors_that_are_not_in_the_file_or_not_finite_are_refused(tmp_path, tensor):
+    torch.save({"stem": tensor}, tmp_path / "odd.pth")
+    with pytest.raises(UserError, match="not plain tensors of finite numbers: stem"):
+        read_official_checkpoint(tmp_path / "odd.pth")
+
+
+def test_an_archive_that_would_fill_the_memory_is_not_unpacked(tmp_path):
+    path = tmp_path / "packed.pth"
+    torch.save({"stem": torch.zeros(2_000_000)}, path)
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    with pytest.raises(UserError, match="packed into far fewer"):
         read_official_checkpoint(path)
 
 

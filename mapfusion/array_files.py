@@ -1,0 +1,37 @@
+"""Files of named arrays (``.npz``): never a pickle, and never more than the memory takes."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_BYTES = 2 << 30
+"""What a file may take when it is unpacked."""
+
+
+def read_arrays(path: Path, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file, all but some.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged or no such archive, too large, or holds what would have to be unpickled.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = sum(member.file_size for member in archive.infolist())
+        if unpacked > MOST_BYTES:
+            raise ValueError(f"it would take {unpacked:,} bytes when it is unpacked")
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files if name not in without}
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("a member is no array of numpy's")
+        return arrays
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # a damaged file may raise anything while its headers are parsed
+        raise ValueError(str(error) or type(error).__name__) from error
