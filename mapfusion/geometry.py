@@ -57,6 +57,8 @@ def rigid_pose_problem(a_to_b: Float) -> str | None:
         return "pose is not 4 x 4"
     if not np.isfinite(pose).all():
         return "pose is not finite"
+    if np.abs(pose[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        return "the last row of the pose is not 0, 0, 0, 1 (are rows and columns exchanged?)"
     if np.abs(pose[:3, 3]).max() > FARTHEST_POSE:
         return f"pose lies more than {FARTHEST_POSE:g} m away"
     rotation = pose[:3, :3]

@@ -22,6 +22,9 @@ from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import ground_within, rings_around
 
+BEGINNINGS = (b"SQLite format 3\0", b"fgb", b"{")
+"""Of what is read; GDAL knows many more, some of which send it to other files, or to the network."""
+
 CHANGED_GROUND = 1e-11
 """Difference from which on the layer of observed ground counts as changed, square degrees (0.1 square metres)."""
 
@@ -143,6 +146,9 @@ def driver_errors_told(path: Path) -> Iterator[None]:
 
     if not path.is_file():
         raise FileNotFoundError(2, "No such file or directory", str(path))
+    with path.open("rb") as file:
+        if not file.read(16).startswith(BEGINNINGS):
+            raise ValueError(f"{path}: its content is neither a GeoPackage nor a FlatGeobuf")
     try:
         yield
     except (

@@ -105,6 +105,8 @@ def _transformer(name: str) -> Any:
     """Return the transformer of a system, None for longitude and latitude themselves; raises ValueError."""
     if not name.strip():
         raise ValueError("it names none")
+    if "undefined" in name[:40].lower():  # of a GeoPackage: degrees, but nobody knows on which datum
+        raise ValueError("it is undefined")
     if name in ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84"):
         return None
     from pyproj import CRS, Transformer

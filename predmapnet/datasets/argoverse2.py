@@ -30,7 +30,7 @@ from predmapnet.datasets.argoverse2_frames import (
     strided_over_time,
     sweeps_with_images,
 )
-from predmapnet.datasets.fields import check_principal_point, whole_field
+from predmapnet.datasets.fields import check_mounting, check_principal_point, whole_field
 from predmapnet.datasets.georeference import argoverse2_georeference
 from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth, united_map
 from predmapnet.datasets.ground_truth.cache import all_truths
@@ -371,15 +371,14 @@ def _camera(name: str, intrinsics: dict[str, Any], mounting: dict[str, Any], fol
     matrix[[0, 1, 0, 1], [0, 1, 2, 2]] = [intrinsics[key] for key in INTRINSICS[:4]]
     width, height = whole_field(intrinsics, "width_px", where), whole_field(intrinsics, "height_px", where)
     check_principal_point(matrix, width, height, where)
+    mounted = f"{folder / 'egovehicle_SE3_sensor.feather'}, {name}"
+    camera_to_ego = pose_matrix([mounting[key] for key in QUATERNION], [mounting[key] for key in TRANSLATION], mounted)
+    check_mounting(camera_to_ego, mounted)
     return Camera(
         name=name,
         width=width,
         height=height,
         intrinsics=matrix,
-        camera_to_ego=pose_matrix(
-            [mounting[key] for key in QUATERNION],
-            [mounting[key] for key in TRANSLATION],
-            f"{folder / 'egovehicle_SE3_sensor.feather'}, {name}",
-        ),
+        camera_to_ego=camera_to_ego,
         ground_height=GROUND_HEIGHT,
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +39,16 @@ def find_logs(root: Path) -> dict[str, Path]:
     if (root / POSES).is_file():
         return {root.name: root}
     patterns = [f"*/{POSES}", *(f"{split}/*/{POSES}" for split in SPLITS)]
-    return {path.parent.name: path.parent for pattern in patterns for path in sorted(root.glob(pattern))}
+    return named_apart(path.parent for pattern in patterns for path in sorted(root.glob(pattern)))
+
+
+def named_apart(folders: Iterable[Path]) -> dict[str, Path]:
+    """Return folders by name; where another one had the name before, a number tells them apart."""
+    found: dict[str, Path] = {}
+    for folder in folders:
+        names = (folder.name if number == 1 else f"{folder.name} ({number})" for number in count(1))
+        found[next(name for name in names if name not in found)] = folder
+    return found
 
 
 def every_sweep(folder: Path) -> Integer:

@@ -10,6 +10,8 @@ import numpy as np
 from mapfusion.arrays import Float
 from predmapnet.errors import UserError
 
+FARTHEST_CAMERA = 100.0
+"""Metres from the ego origin."""
 EXACT = 2**53
 """Whole numbers below are exact whatever number they are stored as."""
 
@@ -57,6 +59,13 @@ def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> U
     token = record.get("token")
     which = f", record {str(token)[:60]}" if token is not None else ""
     return UserError(f"{where}{which}: the field '{name}' {found}; {expected} is expected.")
+
+
+def check_mounting(camera_to_ego: Float, where: str) -> None:
+    """Raise UserError for a camera that no car carries, metres away: its translation is in another unit."""
+    away = float(np.linalg.norm(camera_to_ego[:3, 3]))
+    if away > FARTHEST_CAMERA:
+        raise UserError(f"{where}: the camera would be {away:,.0f} m from the ego origin: is that in millimetres?")
 
 
 def check_principal_point(intrinsics: Float, width: int, height: int, where: str) -> None:

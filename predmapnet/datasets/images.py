@@ -42,7 +42,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise UserError(f"Cannot read the image {path}: {error.strerror}.") from None
     # OpenCV fills an image that was cut short or damaged with grey and says nothing that a program hears.
-    image_size(data, f"The image {path}")
+    stored_size(data, f"The image {path}")
     try:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _AS_STORED)
     except cv2.error:
@@ -68,7 +68,7 @@ def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
     return undistorted(image, camera)
 
 
-def image_size(data: bytes, where: str) -> tuple[int, int]:
+def stored_size(data: bytes, where: str) -> tuple[int, int]:
     """Return width and height of a JPEG or PNG, of which no pixel is decoded.
 
     Raises UserError, which begins with ``where``, for one that is damaged, cut short, larger than any camera's, or

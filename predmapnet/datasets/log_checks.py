@@ -9,6 +9,8 @@ import numpy as np
 from mapfusion.arrays import Float, Integer
 from predmapnet.datasets.fields import numbers
 from predmapnet.datasets.plausibility import (
+    FASTEST,
+    NANOSECONDS,
     camera_problem,
     judged_unit,
     reordered_rotations,
@@ -34,7 +36,7 @@ def check_cameras(stored: Sequence[object], where: str) -> None:
 
 
 def check_clock(times: Integer, positions: Float, stated: str, where: str) -> None:
-    """Raise UserError for time stamps that can only be of another unit than the data set's.
+    """Raise UserError for time stamps or positions that can only be of another unit than the data set's.
 
     Args:
         times: ``(n,) int64``, ascending, in the unit ``stated``.
@@ -45,6 +47,13 @@ def check_clock(times: Integer, positions: Float, stated: str, where: str) -> No
     unit = judged_unit(times, positions, stated)
     if unit != stated:
         raise UserError(f"{where}: the time stamps seem to be {unit}; {stated} are expected.")
+    seconds = np.diff(times) * (NANOSECONDS[stated] / 1e9)
+    metres = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    speed = float(np.median(metres / np.maximum(seconds, 1e-9))) if len(times) > 1 else 0.0
+    if speed > FASTEST:
+        raise UserError(
+            f"{where}: the car would drive {speed:,.0f} m/s. Are the poses in millimetres? Metres are expected."
+        )
 
 
 def check_drive(quaternions: Float, positions: Float, where: str) -> None:

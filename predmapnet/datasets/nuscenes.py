@@ -14,7 +14,14 @@ from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.geometry import inverse_pose
 from mapfusion.georeference import Georeference
-from predmapnet.datasets.fields import EXACT, check_principal_point, numbers_field, text_field, whole_field
+from predmapnet.datasets.fields import (
+    EXACT,
+    check_mounting,
+    check_principal_point,
+    numbers_field,
+    text_field,
+    whole_field,
+)
 from predmapnet.datasets.georeference import demo_georeference, nuscenes_georeference
 from predmapnet.datasets.ground_truth.cache import all_truths
 from predmapnet.datasets.ground_truth.map_file import read_map_file
@@ -343,6 +350,7 @@ class NuScenesScene:
         intrinsics = numbers_field(calibration, "camera_intrinsic", (3, 3), where)
         width, height = whole_field(record, "width", table), whole_field(record, "height", table)
         check_principal_point(intrinsics, width, height, where)
+        check_mounting(self._sensor_to_ego(record, where), where)
         return Camera(
             name=channel,
             width=width,

@@ -26,6 +26,8 @@ MOVING = 0.3
 """Shorter steps do not tell where a car drives, metres."""
 STEEPEST = 30.0
 """No road tilts a car by more, degrees."""
+ROLLED = 0.3
+"""A level camera has the sky on top of its images if the cosine of its roll is above this."""
 SIDEWAYS = 60.0
 """A car that drives at more than this to its x axis drives sideways or backwards, degrees."""
 
@@ -92,7 +94,7 @@ def drives_backwards(rotations: Float, positions: Float) -> bool:
 
 
 def camera_problem(rotations: Float, reordered: Float) -> str | None:
-    """Say whether cameras look at the road only if their quaternions are in another order; None if all is well.
+    """Say whether cameras look at the road only if their quaternions are in another order, or not at all, or None.
 
     ``reordered`` are the ``camera_to_ego`` rotations that the same quaternions mean if they are x, y, z, w.
     """
@@ -100,6 +102,12 @@ def camera_problem(rotations: Float, reordered: Float) -> str | None:
         return (
             "most cameras look at the sky, at the ground or stand on their heads. The quaternions seem to be in the "
             "order x, y, z, w, which would fit; w, x, y, z is expected"
+        )
+    level = np.abs(rotations[:, 2, 2]) < 0.71
+    if len(level) > 2 and (level & (-rotations[:, 2, 1] < ROLLED)).mean() > 0.5:
+        return (
+            "most cameras lie on their sides or stand on their heads. Are their rotations inverted? The way from the "
+            "camera (x right, y down, z ahead) to the car is expected"
         )
     return None
 

@@ -243,6 +243,9 @@ def _polyline(where: str, vector: Any) -> Float:
 def _check_metres(path: Path, frames: Mapping[str, SubmittedFrame]) -> None:
     held = [frame.polylines for frame in frames.values() if frame.polylines]
     normalised = [lines for lines in held if all((np.abs(line - 0.5) <= _NORMALISED_REACH).all() for line in lines)]
+    about_zero = all((np.abs(line) <= 1.0).all() for lines in held for line in lines)
+    if about_zero and len(normalised) < len(held) and sum(map(len, held)) >= _ENOUGH_TO_JUDGE:
+        raise UserError(f"{path}: all points lie between -1 and 1, so they are normalised; metres are expected.")
     if sum(map(len, normalised)) < _ENOUGH_TO_JUDGE:
         return
     if len(normalised) < len(held):

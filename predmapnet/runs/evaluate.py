@@ -19,6 +19,7 @@ from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import SceneMeasurement, measure_scene
 from predmapnet.evaluation.recognition import check_region, frames_look_like, looks_foreign, region_of
 from predmapnet.evaluation.stability_protocol import Protocol
+from predmapnet.files import file_name
 from predmapnet.frame_files.parquet import read_frames, refuse_pickle, stored_scenes
 from predmapnet.frame_files.submission import NOTHING, SubmittedFrame, position_name, read_submission
 from predmapnet.machine import NetworkOptions, use_threads
@@ -239,7 +240,9 @@ def _scene_by_name(submission: Submitted, source: SceneSource) -> dict[str, str]
 def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str]:
     """Names of the scenes that results hold; ``every_frame``: all frames of a submission must be known."""
     if results.is_dir():
-        names = {path.stem for path in results.glob("[!.]*.parquet")}  # A dot begins what is being written.
+        files = {path.stem for path in results.glob("[!.]*.parquet")}  # A dot begins what is being written.
+        scenes = {file_name(info.name): info.name for info in source.scenes()}
+        names = {scenes.get(file, file) for file in files}
         if not names:
             raise UserError(
                 f"The folder {results} holds no per-frame results (*.parquet); "
@@ -289,7 +292,7 @@ def _submitted_maps(path: Path, submitted: Submitted, roi: RegionOfInterest, sce
 def _stored_maps(results: Path, scene: Scene, dataset: str) -> _Found:
     """Return the stored predictions for each frame of a scene; a frame that the file lacks has none."""
     name = scene.info.name
-    path = results / f"{name}.parquet" if results.is_dir() else results
+    path = results / f"{file_name(name)}.parquet" if results.is_dir() else results
     content = read_frames(path, name)
     stored = {frame.index: frame.frame_map for frame in content.frames}
     if len(stored) < len(content.frames):

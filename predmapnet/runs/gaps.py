@@ -1,4 +1,4 @@
-"""Gaps of a run: missing images of cameras, and an empty map. They are said, and written into every file."""
+"""Oddities of a run: images that it lacked, how its car drove, an empty map. They are said, and written down."""
 
 from __future__ import annotations
 
@@ -6,8 +6,16 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
+from predmapnet.datasets.plausibility import drives_backwards
 from predmapnet.mapping import SceneRun
 from predmapnet.scenes import Frame
+
+BACKWARDS = (
+    "By its poses the car drives sideways or backwards throughout: the map is right only if it did (x of the ego frame "
+    "points forward; headings are in radians)."
+)
 
 
 def missing_images(frames: Iterable[Frame]) -> dict[str, int]:
@@ -32,6 +40,9 @@ def with_gaps(provenance: Mapping[str, Any], run: SceneRun) -> tuple[dict[str, A
     if missing := missing_images(run.frames):
         told["missing_images"] = missing
         notes.append(missing_sentence(missing, len(run.frames)))
+    poses = np.array([frame.ego_to_global for frame in run.frames])
+    if drives_backwards(poses[:, :3, :3], poses[:, :2, 3]):
+        notes.append(BACKWARDS)
     if len(run.global_map) == 0:
         notes.append(empty_sentence(len(run.frames)))
     if notes:

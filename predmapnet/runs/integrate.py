@@ -157,6 +157,7 @@ def _placed(
             f"Its tokens look like {', '.join(list(poses)[:NAMED])}."
         )
     _check_region(frames_path, submitted.values(), roi)
+    _check_scores(frames_path, submitted.values())
     seen = {pose.token: frame for token, frame in submitted.items() for pose in (found[token],)}
     empty = len(poses) - len(seen)
     if empty:
@@ -192,6 +193,16 @@ def _by_name(submitted: Mapping[str, SubmittedFrame], poses: Mapping[str, FrameP
         scenes.setdefault(pose.scene, []).append(pose)
     places = {position_name(scene, i): pose for scene, own in scenes.items() for i, pose in enumerate(own)}
     return {token: places[token] for token in submitted if token in places}
+
+
+def _check_scores(path: Path, frames: Iterable[SubmittedFrame]) -> None:
+    scores = np.concatenate([np.zeros(0), *(frame.scores for frame in frames)])
+    told = scores[np.isfinite(scores)]
+    if 2 * ((told < 0.0) | (told > 1.0)).sum() > max(len(scores), 1):
+        raise UserError(
+            f"{path}: most scores lie outside of 0 to 1 (from {told.min():g} to {told.max():g}). Are they percent, or "
+            "logits? Probabilities are expected."
+        )
 
 
 def _check_region(path: Path, frames: Iterable[SubmittedFrame], roi: RegionOfInterest) -> None:

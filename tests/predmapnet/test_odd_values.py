@@ -1,11 +1,20 @@
 """Values that no writer of ours leaves, found by mutating files: each is told with its file, and none is taken."""
 
 import json
+import shutil
 
+import numpy as np
 import pytest
 
+from mapfusion import RegionOfInterest
+from predmapnet.datasets.argoverse2 import Argoverse2Source
+from predmapnet.datasets.ground_truth.argoverse2 import Argoverse2GroundTruth
+from predmapnet.datasets.ground_truth.nuscenes import NuScenesGroundTruth
+from predmapnet.datasets.own_logs.source import LogSource
 from predmapnet.errors import UserError
+from predmapnet.frame_files.pose_file import read_poses
 from tests.fuzzing.readers import READERS
+from tests.predmapnet.datasets.conftest import map_expansion
 
 HUGE, DEEP = "9" * 400, "[" * 200 + "]" * 200
 
@@ -30,6 +39,8 @@ HUGE, DEEP = "9" * 400, "[" * 200 + "]" * 200
         ("log", "truth.json", "-10.0", "1e300", "at most 1e"),
         ("log", "georeference.json", "49.0", HUGE, "'latitude'"),
         ("log", "poses.csv", "x,y", "x,x", "two columns x"),
+        ("log", "calibration.json", "1.2", "1200", "is that in millimetres"),
+        ("nuscenes", "singapore-onenorth.json", '"token": "node-1"', '"token": "node-0"', "node-0 lies in two places"),
         ("poses", "poses.txt", "1500000000.000000 ", "²²²²²²²²²²²²²²²² ", "no number"),
         ("poses", "poses.txt", "1500000000.500000 2.0", "1500000000.500000 1e200", "not a rigid motion"),
         ("poses", "list.json", "2.0", HUGE, "pose needs"),
@@ -71,3 +82,59 @@ def test_summaries_of_other_programs_are_no_records_of_a_batch(tmp_path):
         (tmp_path / f"other{number}.summary.json").write_text(json.dumps(content))
     READERS["records"].read(tmp_path, tmp_path)
     assert [scene["scene"] for scene in json.loads((tmp_path / "summary.json").read_text())["scenes"]] == ["a", "b"]
+
+
+def test_two_logs_of_one_name_are_told_apart(tmp_path):
+    for reader, source in (("log", LogSource), ("argoverse2", Argoverse2Source)):
+        (tmp_path / reader).mkdir()
+        READERS[reader].write(tmp_path / reader)
+        logs = tmp_path / reader / "logs"
+        shutil.copytree(logs / "log", logs / "val" / "log")
+        opened = source(logs)
+        assert [(info.name, info.split) for info in opened.scenes()] == [("log", "test"), ("log (2)", "val")]
+        assert opened.open("log (2)").info.name == "log (2)"
+
+
+def test_what_encloses_nothing_does_not_refuse_a_whole_map():
+    """A hole of two nodes, a lane with one point on a side, a crossing of two points."""
+    nuscenes = map_expansion()
+    nuscenes["polygon"][0]["holes"] = [{"node_tokens": ["n0", "n1"]}, {"node_tokens": ["n0"]}]
+    assert len(NuScenesGroundTruth(nuscenes).road_segments) == 1
+    point = {"x": 0.0, "y": 0.0, "z": 0.0}
+    lane = {"id": 1, "is_intersection": False, "left_lane_boundary": [point], "right_lane_boundary": [point]}
+    lane |= {"left_neighbor_id": 2, "right_neighbor_id": 2, "predecessors": [], "successors": []}
+    crossing = {"edge1": [point], "edge2": [point]}
+    argoverse2 = {"lane_segments": {"1": lane}, "pedestrian_crossings": {"1": crossing}, "drivable_areas": {}}
+    truth = Argoverse2GroundTruth(argoverse2).frame(np.eye(4), RegionOfInterest())
+    assert len(truth.kinds) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scores": [90.0, 80.0]}, "most scores lie outside of 0 to 1"),
+        ({"vectors": [[[-0.5, 0.1], [0.5, 0.1]]] * 2}, "all points lie between -1 and 1"),
+    ],
+)
+def test_results_on_other_scales_give_no_empty_map(tmp_path, changes, message):
+    READERS["results"].write(tmp_path)
+    path = tmp_path / "maptracker.json"
+    frames = json.loads(path.read_text())["results"]
+    results = {f"t{number}": {**frames["t0"], **changes} for number in range(6)}
+    path.write_text(json.dumps({"results": results}))
+    poses = json.loads((tmp_path / "poses.json").read_text())
+    more = [{**poses[0], "token": f"t{n}", "timestamp": poses[0]["timestamp"] + n * 10**8} for n in range(6)]
+    (tmp_path / "poses.json").write_text(json.dumps(more))
+    with pytest.raises(UserError, match=message):
+        READERS["results"].read(tmp_path, path)
+
+
+def test_a_pose_with_rows_and_columns_exchanged_is_refused(tmp_path):
+    READERS["poses"].write(tmp_path)
+    path = tmp_path / "matrices.json"
+    poses = json.loads(path.read_text())
+    for pose in poses.values():
+        pose["ego_to_global"] = np.array(pose["ego_to_global"]).T.tolist()
+    path.write_text(json.dumps(poses))
+    with pytest.raises(UserError, match="rows and columns exchanged"):
+        read_poses(path)

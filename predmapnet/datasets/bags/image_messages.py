@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from predmapnet.datasets.images import image_size
+from predmapnet.datasets.images import stored_size
 from predmapnet.errors import UserError
 
 COMPRESSED, RAW = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image"
@@ -72,7 +72,7 @@ def _compressed(data: bytes, stated: str) -> tuple[bytes, str]:
     if mosaic or "compressedDepth" in stated or stated.startswith(("16UC1", "32FC1")):
         raise UserError(f"its images are '{stated}', no pictures in colours or grey")
     if data[:2] == JPEG or data[:4] == PNG:
-        image_size(data, "the image")
+        stored_size(data, "the image")
         return data, ".jpg" if data[:2] == JPEG else ".png"
     raise UserError(f"its images are '{stated}', neither JPEG nor PNG; republish them so (image_transport)")
 

@@ -63,7 +63,7 @@ class Argoverse2GroundTruth:
         content, self.fingerprint = read_map_file(map_file)
         name = "the map" if isinstance(map_file, Mapping) else str(map_file)
         try:
-            lanes = list(content["lane_segments"].values())
+            lanes = [lane for lane in content["lane_segments"].values() if _has_sides(lane)]
             crossings = [
                 np.concatenate([_points(record["edge1"]), _points(record["edge2"])[::-1]])
                 for record in content["pedestrian_crossings"].values()
@@ -71,7 +71,7 @@ class Argoverse2GroundTruth:
             areas = [_points(record["area_boundary"]) for record in content["drivable_areas"].values()]
             areas = [points for points in areas if len(points) >= 3]  # fewer enclose nothing
             self._index_lanes(lanes)
-            self._crossings = np.array([Polygon(points) for points in crossings], dtype=object)
+            self._crossings = np.array([Polygon(line if len(line) >= 3 else None) for line in crossings], dtype=object)
             drivable = np.array([Polygon(points) for points in areas], dtype=object)
         except MALFORMED as error:
             raise UserError(
@@ -226,6 +226,11 @@ def united_map(files: Sequence[Path]) -> dict[str, dict[str, Any]]:
             own = digest.hex() if layer == "drivable_areas" else ""
             records.update({f"{own}{name}": record for name, record in found.items()})
     return united
+
+
+def _has_sides(lane: Mapping[str, Any]) -> bool:
+    """Whether a lane has a line on either side; a single point is none."""
+    return min(len(lane["left_lane_boundary"]), len(lane["right_lane_boundary"])) >= 2
 
 
 def _side(lane: Mapping[str, Any], points: Float, which: str) -> LaneSide | None:

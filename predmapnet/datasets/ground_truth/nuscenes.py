@@ -68,7 +68,7 @@ class NuScenesGroundTruth:
         if not isinstance(map_file, Mapping):
             check_version(content, name)
         try:
-            nodes = {node["token"]: _position(node) for node in content["node"]}
+            nodes = _positions(content["node"])
             lines = {line["token"]: line["node_tokens"] for line in content["line"]}
             polygons = {polygon["token"]: polygon for polygon in content["polygon"]}
             self._index(
@@ -268,8 +268,17 @@ def _polygons(
         if len(exterior) < 3:
             result.append(Polygon())
             continue
-        result.append(Polygon(exterior, [hole for hole in holes if hole]))
+        result.append(Polygon(exterior, [hole for hole in holes if len(hole) >= 3]))  # fewer enclose nothing
     return result
+
+
+def _positions(nodes: Iterable[Mapping[str, Any]]) -> dict[str, tuple[float, float]]:
+    found: dict[str, tuple[float, float]] = {}
+    for node in nodes:
+        position = _position(node)
+        if found.setdefault(node["token"], position) != position:
+            raise ValueError(f"the node {node['token']} lies in two places")
+    return found
 
 
 def _position(node: Mapping[str, Any]) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mapfusion.arrays import Float
-from predmapnet.datasets.fields import check_principal_point, numbers_field, text_field, whole_field
+from predmapnet.datasets.fields import check_mounting, check_principal_point, numbers_field, text_field, whole_field
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.datasets.log_checks import check_cameras
 from predmapnet.datasets.poses import pose_matrix
@@ -94,7 +94,9 @@ def _mounting(entry: Mapping[str, Any], where: str) -> Float:
     rotation, translation = (
         numbers_field(mounting, name, (size,), where) for name, size in (("rotation_wxyz", 4), ("translation_m", 3))
     )
-    return pose_matrix(rotation.tolist(), translation.tolist(), where)
+    camera_to_ego = pose_matrix(rotation.tolist(), translation.tolist(), where)
+    check_mounting(camera_to_ego, where)
+    return camera_to_ego
 
 
 def _object(entry: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:

@@ -45,13 +45,14 @@ class LogScene:
         timestamps: ``(n,) int64`` of the frames, nanoseconds.
     """
 
-    def __init__(self, folder: Path, rate: float = RATE, split: str = "test") -> None:
+    def __init__(self, folder: Path, rate: float = RATE, split: str = "test", name: str | None = None) -> None:
         """Read calibration and poses; images are named, not read.
 
         Args:
             folder: of the log.
             rate: frames a second at most.
             split: that the log belongs to.
+            name: of the log; that of its folder without.
 
         Raises:
             UserError: a file is missing or damaged, or images and poses are not of the same time.
@@ -62,7 +63,9 @@ class LogScene:
         self.poses: TimedPoses = read_timed_poses(folder, calibration.poses_of)
         self.georeference = _georeference(folder / "georeference.json")
         self.timestamps: Integer = self._instants(rate)
-        self.info = SceneInfo(folder.resolve().name, split, len(self.timestamps), "", description=self._left_out())
+        self.info = SceneInfo(
+            name or folder.resolve().name, split, len(self.timestamps), "", description=self._left_out()
+        )
 
     @cached_property
     def images(self) -> dict[str, tuple[Integer, list[Path]]]:

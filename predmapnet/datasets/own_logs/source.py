@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from mapfusion.elements import GlobalMap, RegionOfInterest
+from predmapnet.datasets.argoverse2_files import named_apart
 from predmapnet.datasets.own_logs.calibration import CALIBRATION
 from predmapnet.datasets.own_logs.scene import RATE, LogScene
 from predmapnet.datasets.splits import SPLITS, check_split
@@ -19,7 +20,7 @@ def find_own_logs(root: Path) -> dict[str, Path]:
     if (root / CALIBRATION).is_file():
         return {root.resolve().name: root}
     patterns = [f"*/{CALIBRATION}", *(f"{split}/*/{CALIBRATION}" for split in SPLITS)]
-    return {path.parent.name: path.parent for pattern in patterns for path in sorted(root.glob(pattern))}
+    return named_apart(path.parent for pattern in patterns for path in sorted(root.glob(pattern)))
 
 
 class LogSource:
@@ -68,7 +69,7 @@ class LogSource:
             near = difflib.get_close_matches(scene, list(self.folders), n=4, cutoff=0.3)
             hint = f" Did you mean {', '.join(near)}?" if near else ""
             raise UserError(f"{self.root} holds no log '{scene}' among its {len(self.folders)} logs.{hint}")
-        return LogScene(self.folders[scene], self.rate, self._split(scene))
+        return LogScene(self.folders[scene], self.rate, self._split(scene), scene)
 
     def truth_map(self, scenes: Sequence[str], roi: RegionOfInterest) -> GlobalMap | None:
         """Return the true lines of one log: logs of one's own have no location in common."""

@@ -1,5 +1,7 @@
 """The Argoverse 2 reader, on a log made from nothing."""
 
+import json
+
 import numpy as np
 import pyarrow
 import pytest
@@ -9,7 +11,7 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.datasets.argoverse2 import Argoverse2Source
 from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS as CAMERAS
 from predmapnet.errors import UserError
-from tests.predmapnet.datasets.small_argoverse2 import START, SWEEP, write_log
+from tests.predmapnet.datasets.small_argoverse2 import START, SWEEP, point, write_log
 
 
 @pytest.fixture

@@ -88,8 +88,8 @@ def in_millimetres(cameras) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (in_millimetres, "front would be 1.* millimetres"),
-        (inverted, "inverted, all cameras sit well"),
+        (in_millimetres, "camera would be 2,.* millimetres"),
+        (inverted, "Are their rotations inverted"),
         (swapped, "left: .* if the camera looks the other way"),
         (turned("y", 25.0), "front: .* look at its picture"),
         (turned("z", 180.0), "front: .* looks the other way"),
