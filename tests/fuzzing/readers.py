@@ -93,7 +93,7 @@ def _read_source(source: SceneSource) -> None:
             if scene.georeference is not None:
                 with value_errors_told():
                     assert np.isfinite(scene.georeference.to_wgs84(frame.ego_to_global[None, :2, 3])).all()
-        scene.truth_map()
+        scene.truth_map(ROI)
         source.scenes_of(["scene-0001-0", "log_1500000000000000000"])
 
 
