@@ -27,7 +27,12 @@ SECONDS_BETWEEN_LINES = 5.0
 
 def say_error(message: str) -> None:
     """Print an error that the user can put right."""
-    err.print(f"[bold red]Error:[/] {escape(message)}")
+    err.print(f"[bold red]Error:[/] {escape(printable(message))}")
+
+
+def printable(text: str) -> str:
+    """Return a text with what data may bring to move a terminal's cursor or change its colours spelled out."""
+    return "".join(each if each.isprintable() or each == "\n" else repr(each)[1:-1] for each in text)
 
 
 def print_json(content: object) -> None:
@@ -45,7 +50,7 @@ def counted(count: int, noun: str) -> str:
 
 def say_warning(message: str) -> None:
     """Print a note for the user."""
-    err.print(f"[bold yellow]Note:[/] {escape(message)}")
+    err.print(f"[bold yellow]Note:[/] {escape(printable(message))}")
 
 
 class ProgressDisplay:

@@ -32,6 +32,9 @@ ARGOVERSE2_CITIES = {
 }
 """Latitude, longitude and UTM zone (north) of the city frames' origins, from the av2 package."""
 
+SEEDS = 10_000
+"""Number of the demo world's towns."""
+
 POINT_NEMO = (-48.8767, -123.3933)
 """Latitude and longitude of the point of the ocean farthest from any land: home of the demo world."""
 
@@ -147,8 +150,10 @@ def argoverse2_georeference(city: str) -> UtmGeoreference | None:
 def demo_georeference(name: str, index: int) -> SphereGeoreference:
     """Return a place in the South Pacific for a demo town of that seed.
 
-    Towns lie on a grid of 0.1 degrees and never overlap; they may be 10 km across.
+    Towns lie on a grid of 0.1 degrees and never overlap; they may be 10 km across. Raises UserError for other seeds.
     """
+    if not 0 <= index < SEEDS:
+        raise UserError(f"{name}: there is no town {index}; towns are numbered from 0 to {SEEDS - 1}.")
     row, column = divmod(index, 20)
     return SphereGeoreference(name, POINT_NEMO[0] + 0.1 * row, POINT_NEMO[1] + 0.1 * column)
 

@@ -47,6 +47,8 @@ def check_clock(times: Integer, positions: Float, stated: str, where: str) -> No
     unit = judged_unit(times, positions, stated)
     if unit != stated:
         raise UserError(f"{where}: the time stamps seem to be {unit}; {stated} are expected.")
+    if len(times) and float(np.abs(times).max()) * NANOSECONDS[stated] >= 2.0**63:
+        raise UserError(f"{where}: the time {times[0]} is too large for {stated}.")
     seconds = np.diff(times) * (NANOSECONDS[stated] / 1e9)
     metres = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     speed = float(np.median(metres / np.maximum(seconds, 1e-9))) if len(times) > 1 else 0.0

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import predmapnet as package
+from cli.console import say_error
 
 HEAVY = ("torch", "numba", "rerun", "cv2", "shapely", "pyarrow", "scipy", "numpy")
 
@@ -80,3 +81,8 @@ def test_a_map_can_be_looked_at_and_a_broken_one_is_told(predmapnet, tiny_root, 
     assert broken.code == 2
     assert "broken.geojson" in broken.err
     assert predmapnet("view", "nothing.rrd").code == 2
+
+
+def test_names_from_data_cannot_write_to_the_terminal(capsys):
+    say_error("no scene 'a\x1b[2J\u202e[bold]'\nNext line.")
+    assert capsys.readouterr().err == "Error: no scene 'a\\x1b[2J\\u202e[bold]'\nNext line.\n"
