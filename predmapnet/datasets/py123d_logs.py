@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from mapfusion.arrays import Float
 from predmapnet.datasets.fields import numbers_field
-from predmapnet.datasets.images import check_jpeg
+from predmapnet.datasets.images import stored_size
 from predmapnet.datasets.own_logs.calibration import CALIBRATION, write_calibration
 from predmapnet.datasets.own_logs.made_log import MadeLog, check_made_log, count_and_rate
 from predmapnet.datasets.own_logs.pose_files import POSE_FILES
@@ -190,9 +190,5 @@ def _file(root: Path, name: str) -> bytes:
 
 
 def _ending(content: bytes, path: Path) -> str:
-    if content[:2] == b"\xff\xd8":
-        check_jpeg(content, str(path))
-        return ".jpg"
-    if content[:4] == b"\x89PNG":
-        return ".png"
-    raise UserError(f"{path}: an image is neither JPEG nor PNG")
+    stored_size(content, f"{path}: an image")
+    return ".jpg" if content[:2] == b"\xff\xd8" else ".png"
