@@ -148,7 +148,7 @@ def driver_errors_told(path: Path) -> Iterator[None]:
         raise FileNotFoundError(2, "No such file or directory", str(path))
     with path.open("rb") as file:
         if not file.read(16).startswith(BEGINNINGS):
-            raise ValueError(f"{path}: its content is neither a GeoPackage nor a FlatGeobuf")
+            raise ValueError(f"{path}: not a map: its content is neither a GeoPackage nor a FlatGeobuf")
     try:
         yield
     except (

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from mapfusion import json_text
 from mapfusion.elements import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.frame_ties import MEMBER, TiedFrame, ties_of
@@ -38,6 +39,10 @@ VERSION = "0.7.0"
 SCHEMA = pa.schema(
     {"object_id": pa.int64(), "map_layer": pa.int8(), "features": pa.binary(), "wkb": pa.binary()}.items()
 )
+
+MALFORMED = (pa.ArrowException, OSError, KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError,
+             shapely.errors.ShapelyError)  # fmt: skip
+"""What a reader trips over in a file that is damaged or another's; Arrow calls damage an OSError."""
 
 
 def write_py123d(
@@ -98,11 +103,11 @@ def read_py123d(path: Path, georeference: InvertibleGeoreference | None = None) 
     try:
         table = pa.ipc.open_file(pa.py_buffer(content)).read_all()
         table.validate(full=True)
-        origin = json.loads((table.schema.metadata or {}).get(MEMBER.encode(), b"null"))
+        origin = json_text.parse((table.schema.metadata or {}).get(MEMBER.encode(), b"null"))
         if not isinstance(origin, dict):
             raise ValueError(f"its schema has no member '{MEMBER}' that says where the map lies")
         features = list(_features(table, TiedFrame(origin.pop("ties", None)), notes))
-    except (pa.ArrowException, KeyError, TypeError, ValueError, AttributeError, shapely.errors.ShapelyError) as error:
+    except MALFORMED as error:
         told = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: no py123d map of ours as it should be: {told}") from error
     to_degrees = ToDegrees("EPSG:4326", str(path))
