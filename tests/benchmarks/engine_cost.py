@@ -180,7 +180,8 @@ def _compare(engine: str, root: Path, count: int, rounds: int) -> None:
     for jobs, run in ((1, one), (2, two)):
         print(
             f"{engine}, {jobs} at work: {run.scene:.2f} CPU s a scene, the engine {1e3 * run.engine:.1f} CPU ms "
-            f"({100 * run.engine / run.wall:.1f} % of a core), workers without work {100 * (1 - run.busy):.2f} % of the time; "
+            f"({100 * run.engine / run.wall:.1f} % of a core), "
+            f"workers without work {100 * (1 - run.busy):.2f} % of the time; "
             f"{run.wall:.2f} s wall a scene at load {os.getloadavg()[0]:.0f}"
         )
     gain = 2 * two.busy / (two.scene + two.engine) * one.scene / one.busy
