@@ -163,7 +163,7 @@ def _read(path: Path) -> dict[str, Any]:
         wrong = [name for name in SCENE_FIGURES if not isinstance(figures, dict) or not _is_figure(figures.get(name))]
         if wrong:
             raise UserError(f"{path}: {wrong[0]} of {scene} is no number.")
-    for section, name in [*_POOLED.values(), ("stability", "interval")]:
+    for section, name in [*POOLED.values(), ("stability", "interval")]:
         figures = content.get(section) or {}
         if not isinstance(figures, dict) or not _is_figure(figures.get(name)):
             raise UserError(f"{path}: {name} of {section} is no number.")

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from mapfusion.formats.local_plane import LocalPlane
+from predmapnet.errors import UserError
 from predmapnet.machine import NetworkOptions, Precision
-from predmapnet.runs.batch import BatchSettings
+from predmapnet.runs.batch import BatchSettings, _map_scene
 from predmapnet.runs.batch_records import (
     DONE,
     Outcome,
@@ -25,7 +26,8 @@ from predmapnet.runs.batch_records import (
 from predmapnet.runs.output_folder import OutputFolder
 from predmapnet.runs.scene_choice import ListedScene
 
-REPORT = {"frames": 3, "seconds": 1.0}
+REPORT = {"frames": 3, "seconds": 1.0, "frames_per_second": 3.0, "elements": {"divider": 1}, "metres": {"divider": 9.0}}
+REPORT |= {"rejections": {}}
 
 
 @pytest.fixture
@@ -107,3 +109,18 @@ def test_what_changes_no_digit_does_not_make_maps_anew():
     for change in ({"force": True}, {"recordings": True}, {"frames": True}):
         assert replace(SETTINGS, **change).fingerprint(scene) == SETTINGS.fingerprint(scene)
     assert SETTINGS.fingerprint(ListedScene("one", Path("/other"))) != SETTINGS.fingerprint(scene)
+
+
+def test_an_error_that_nobody_foresaw_keeps_its_traceback_and_one_of_the_data_has_none(folder):
+    def outcome(error: Exception) -> Outcome:
+        def pipeline(root):
+            raise error
+
+        return _map_scene(pipeline, folder, SETTINGS, ListedScene("new", None))
+
+    fault = outcome(KeyError("ego_pose"))
+    assert (fault.status, fault.error, fault.reason) == ("failed", "KeyError", "'ego_pose'")
+    assert "Traceback" in (fault.trace or "")
+    told = outcome(UserError("an image is cut short"))
+    assert (told.error, told.reason, told.trace) == ("UserError", "an image is cut short", None)
+    assert done(folder) == {"one", "two"}
