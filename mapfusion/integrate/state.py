@@ -138,7 +138,9 @@ def _restored(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Integr
         for number, (log, (times, positions, believed)) in enumerate(header["logs"].items())
     }
     curves = StationCurve(
-        arrays["points"].reshape(-1, 2), arrays["sums"].reshape(-1, 5), arrays["marks"].reshape(-1, 2)
+        arrays["points"].astype(np.float64).reshape(-1, 2),
+        arrays["sums"].astype(np.float64).reshape(-1, 5),
+        arrays["marks"].astype(np.uint64).reshape(-1, 2),
     )
     at = 0
     for entry in header["lines"]:
