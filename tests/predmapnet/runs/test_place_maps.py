@@ -8,6 +8,7 @@ import pytest
 from mapfusion.elements import ElementKind, FrameMap, GlobalMap, MapElement, RegionOfInterest
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.evaluation.measurement import measure_scene, pool_scenes
+from predmapnet.runs.integrate import with_own_ids
 from predmapnet.runs.place_maps import place_matches
 from predmapnet.scenes import FrameTruth, SceneInfo
 
@@ -110,3 +111,14 @@ def test_without_the_truth_of_a_place_there_is_no_figure():
     bare = [replace(scene, maps=None, global_matches=None) for scene in scenes]
     assert place_matches(Roads({"a": "here", "b": "there"}), bare) is None
     assert pool_scenes(bare).figures()["place_map_ap"] is None
+
+
+def test_elements_without_ids_get_one_each_from_the_score_on():
+    """Ids differ over all frames, so that elements meet by where they lie; weaker ones take no part."""
+    lines = (np.zeros((2, 2)),) * 3
+    scores = (np.array([0.4, 0.39, 0.9]), np.array([0.2, 0.8, 0.4]))
+    frames = [FrameMap(0, np.eye(4), ROI, np.ones(3, int), each, np.full(3, -1), lines) for each in scores]
+    ids = [frame.track_ids.tolist() for frame in with_own_ids(frames)]
+    assert [[number >= 0 for number in own] for own in ids] == [[True, False, True], [False, True, True]]
+    kept = [number for own in ids for number in own if number >= 0]
+    assert len(set(kept)) == len(kept) == 4
