@@ -167,7 +167,7 @@ def main() -> None:
 def _compare(engine: str, root: Path, count: int, rounds: int) -> None:
     """Map scenes with one and with two workers in turn, and print the gain."""
     names = tuple(f"scene-{number:04d}" for number in range(count))
-    data, weights = write_tiny_nuscenes(root / "data", names, frames=6), write_random_weights(root / "w.safetensors")
+    data, weights = write_tiny_nuscenes(root / "data", names, frames=20), write_random_weights(root / "w.safetensors")
     (root / "maps").mkdir()
     network = NetworkOptions(weights)
     settings = BatchSettings("nuscenes", data, network, weights_sha256=weights_hash(weights))
