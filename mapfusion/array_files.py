@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_BYTES = 2 << 30
-"""What a file may take when it is unpacked."""
+"""Most that a file may take when it is unpacked."""
 
 
 def read_arrays(path: Path, without: Collection[str] = ()) -> dict[str, NDArray[Any]]:

@@ -75,3 +75,18 @@ def test_files_have_one_subject_and_public_names_one_meaning():
                 if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
                     owners.setdefault(node.name, set()).add(module_name(path))
     assert {name: found for name, found in owners.items() if len(found) > 1} == {}
+
+
+def texts(source: str) -> list[str]:
+    """Docstrings of a file, and the texts below its constants and attributes."""
+    owners = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    nodes = [node for owner in ast.walk(ast.parse(source)) if isinstance(owner, owners) for node in owner.body]
+    statements = [node for node in nodes if isinstance(node, ast.Expr)]
+    constants = [node.value.value for node in statements if isinstance(node.value, ast.Constant)]
+    return [text.strip() for text in constants if isinstance(text, str)]
+
+
+def test_docstrings_begin_with_their_subject():
+    questions = ("What", "Which", "How", "Where", "Who", "Why", "When")
+    found = [(path.name, text) for path in FILES for text in texts(path.read_text()) if text.split()[0] in questions]
+    assert found == []

@@ -42,7 +42,7 @@ SCHEMA = pa.schema(
 
 MALFORMED = (pa.ArrowException, OSError, KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError,
              shapely.errors.ShapelyError)  # fmt: skip
-"""What a reader trips over in a file that is damaged or another's; Arrow calls damage an OSError."""
+"""Errors of a reader on a file that is damaged or another's; Arrow calls damage an OSError."""
 
 
 def write_py123d(

@@ -181,7 +181,7 @@ class Solids:
 
 @dataclass(frozen=True)
 class Clutter:
-    """What is on the ground and no element of the map, though it may look like one.
+    """Things on the ground that are no elements of the map, though they may look like one.
 
     Attributes:
         patches: (material, ``(n, 4, 2)`` quadrilaterals, metres), each over those before it.

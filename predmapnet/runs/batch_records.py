@@ -133,7 +133,7 @@ class _Accuracy(BaseModel):
 
 
 class _Report(BaseModel):
-    """What of a scene's report is read again."""
+    """Parts of a scene's report that are read again."""
 
     frames: int
     seconds: float

@@ -41,7 +41,7 @@ Draws = Sequence[np.random.Generator]
 
 @dataclass
 class Past:
-    """What one instant hands to the next: the state, whom the tracks stand for, how they were chosen, and from what.
+    """Handover from one instant to the next: the state, whom the tracks stand for, how they were chosen, and from what.
 
     There is no state where every frame stands alone, and nothing was chosen before the first instant.
     """

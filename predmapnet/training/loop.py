@@ -48,7 +48,7 @@ BEST = "best.safetensors"
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """What does not belong to a stage.
+    """Settings that do not belong to a stage.
 
     Attributes:
         seed: of weights, order of the data, augmentation and dropout.

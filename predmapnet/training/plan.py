@@ -57,7 +57,7 @@ class PlannedStage:
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What a user chooses of it.
+    """Parts of a plan that a user chooses.
 
     Attributes:
         devices: number of processes.

@@ -33,12 +33,12 @@ from predmapnet.weights.inspection import parts_of
 
 WEIGHTS = "weights.safetensors"
 Data = tuple[TrainingScenes, list[CachedScene]]
-"""What is trained on, and what is validated on."""
+"""Scenes that are trained on, and those that are validated on."""
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a user chooses.
+    """A run as a user chooses it.
 
     Attributes:
         config: of the network.

@@ -17,12 +17,12 @@ from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.losses.weights import LITE_LOSSES, PAPER_LOSSES, LossWeights
 
 Report = Callable[[str], None]
-"""Where lines for the user go."""
+"""Sink of lines for the user."""
 
 
 @dataclass(frozen=True)
 class OptimiserSettings:
-    """What drives the weights.
+    """Settings of the optimiser and of the learning rate.
 
     Attributes:
         learning_rate: its peak, for the whole batch of the stage.
@@ -75,7 +75,7 @@ class StreamSettings:
 
 @dataclass(frozen=True)
 class TrackRules:
-    """Which rows of a frame are the tracks of the next one.
+    """Rules by which rows of a frame become tracks of the next one.
 
     Attributes:
         score: rows from it on become tracks.
@@ -96,7 +96,7 @@ class TrackRules:
 
 @dataclass(frozen=True)
 class Stage:
-    """What one stage trains: the data, what is frozen, the rates, and the losses.
+    """One stage of a training: the data, what is frozen, the rates, and the losses.
 
     Attributes:
         name: of the stage.

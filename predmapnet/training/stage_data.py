@@ -1,4 +1,4 @@
-"""What one process sees of a stage's data, step after step."""
+"""Data of a stage as one process sees them, step after step."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class TrackTruth:
 
 @dataclass
 class Chosen:
-    """Which rows live on, on the host.
+    """Rows that live on, on the host.
 
     Attributes:
         rows: ``(B, T') int64``, rows of this frame's predictions whose query, points and mask are taken; 0 in padding.

@@ -1,4 +1,4 @@
-"""What a bag holds beside its images: camera infos, transforms, odometry, and the first image of each topic."""
+"""Contents of a bag beside its images: camera infos, transforms, odometry, and the first image of each topic."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Reader:
 
 @dataclass
 class Contents:
-    """What was found.
+    """Findings in a bag.
 
     Attributes:
         graph: frames and the transforms between them.

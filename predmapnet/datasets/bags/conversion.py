@@ -22,7 +22,7 @@ from predmapnet.scenes import Progress
 
 @dataclass(frozen=True)
 class BagOptions:
-    """What a user says where a guess would be wrong.
+    """Choices of a user where a guess would be wrong.
 
     Attributes:
         camera_topics: image topics to take; all that can be used if empty.

@@ -19,7 +19,7 @@ ENDINGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 LARGEST_RECORD = 2**30
 """Bytes; no chunk of a recording is larger, so a longer one is damage."""
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""How a message begins that was compressed by itself."""
+"""First bytes of a message that was compressed by itself."""
 
 BytesRead = Callable[[int, int], None]
 """Callback ``read(done, total)``, bytes of the bag."""

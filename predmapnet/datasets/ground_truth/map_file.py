@@ -14,7 +14,7 @@ from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError
 
 MALFORMED = (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, shapely.GEOSException)
-"""What a reader trips over where a map is not as it should be."""
+"""Errors of a reader on a map that is not as it should be."""
 
 
 def read_map_file(source: Path | Mapping[str, Any]) -> tuple[Mapping[str, Any], bytes]:

@@ -13,7 +13,7 @@ from predmapnet.errors import UserError
 
 @dataclass(frozen=True)
 class MadeLog:
-    """What was written.
+    """Summary of what was written.
 
     Attributes:
         cameras: where the images of each camera come from.

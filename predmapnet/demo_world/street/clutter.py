@@ -101,7 +101,7 @@ def _near(path: Float, near: shapely.Geometry) -> list[Lane]:
 
 
 def _stations(random: Generator, lane: Lane, rate: float, at_ends: bool) -> list[float]:
-    """Where symbols begin, metres along a lane: anywhere, or only before its end."""
+    """Draw the stations at which symbols begin, metres along a lane: anywhere, or only before its end."""
     if at_ends:
         return [lane.length - float(random.uniform(1.0, 9.0))] if random.random() < rate else []
     count = random.poisson(rate * lane.length / 100)

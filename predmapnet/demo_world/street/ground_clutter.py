@@ -222,4 +222,4 @@ GROUND_KINDS: dict[str, tuple[Kind, float, float]] = {
     "shadows": (_shadows, 0.5, 2.5),
     "kerb lines": (_kerb_lines, 0.25, 0.8),
 }
-"""What lays each kind, from bottom to top, the share of cluttered towns that have it, and most per 100 m of lane."""
+"""Kinds from bottom to top: what lays each, the share of cluttered towns that have it, and most per 100 m of lane."""

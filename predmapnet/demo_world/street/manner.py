@@ -13,7 +13,7 @@ FAINT_KERBS = ((0.36, 0.34, 0.16, 0.14), (0.08, 0.37, 0.33, 0.22), (0.05, 0.20, 
 
 
 class Manner(NamedTuple):
-    """What a town does beside its road; as it stands here where nothing was drawn.
+    """Habits of a town beside its road; the defaults stand where nothing was drawn.
 
     Attributes:
         parked: share of the places in parking strips that are taken; None leaves it to the day.

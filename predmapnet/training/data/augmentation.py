@@ -31,7 +31,7 @@ _OTHER_SIDE = {"LEFT": "RIGHT", "RIGHT": "LEFT", "left": "right", "right": "left
 
 @dataclass(frozen=True)
 class AugmentationSettings:
-    """How strongly frames are changed.
+    """Strengths of the changes to frames.
 
     Attributes:
         mirror: probability of swapping left and right.

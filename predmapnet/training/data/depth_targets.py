@@ -1,4 +1,4 @@
-"""What the auxiliary depth head should say: the lidar's points as each camera sees them, in bins (MapTRv2, Sec. 3.4).
+"""Targets of the auxiliary depth head: the lidar's points as each camera sees them, in bins (MapTRv2, Sec. 3.4).
 
 As in BEVDepth (Li et al. 2023), the nearest point of a feature cell counts, and cells without a point say nothing.
 """

@@ -1,4 +1,4 @@
-"""What a stage sees at which step: shuffled epochs of clips, made from the number of the draw alone.
+"""Draws of a stage, step by step: shuffled epochs of clips, made from the number of the draw alone.
 
 Nothing depends on what was drawn before, on the number of processes, or on the workers that load: a resumed run goes
 on with the same frames, and two processes see what one would have seen with the same whole batch.
@@ -27,7 +27,7 @@ from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 
 CROSSING_WEIGHT = 2.5
-"""How often a frame with a crossing is seen in an epoch of single frames, since crossings are rare: all of them twice,
+"""Times that a frame with a crossing is seen in an epoch of single frames, since crossings are rare: all of them twice,
 and a random half of them a third time."""
 PARTS_OF_WEIGHTS = 1024
 """Weights are multiples of one of these parts, so that their sums are exact."""

@@ -43,7 +43,7 @@ BYTES_PER_IMAGE, BYTES_PER_PIXEL = 5000, 0.25
 
 
 class FilledFrame(NamedTuple):
-    """What became of one frame.
+    """Record of one frame.
 
     Attributes:
         made: whether it was not there, damaged, or made from something else.

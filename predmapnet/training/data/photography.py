@@ -24,7 +24,7 @@ DARK_SIDE = 1.7
 
 @dataclass(frozen=True)
 class PhotographySettings:
-    """How different the cameras are. Every field may be zero, which switches its effect off.
+    """Differences between cameras. Every field may be zero, which switches its effect off.
 
     Attributes:
         exposure: largest rise of the exposure, natural logarithm of linear light; it falls by up to 1.7 times that.

@@ -42,7 +42,7 @@ class DataSet:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """What a user chooses.
+    """Data that a user chooses.
 
     Attributes:
         sets: the data sets.

@@ -57,7 +57,7 @@ class CachedFrame:
 
 
 def frame_path(folder: Path, number: int) -> Path:
-    """Where a frame of a scene lies."""
+    """Return the file of a frame of a scene."""
     return folder / f"{number:06d}.npz"
 
 

@@ -174,7 +174,7 @@ def masks_of_size(masks: Tensor, like: Tensor) -> Tensor:
 
 @dataclass
 class Matched:
-    """Who answers for what in one instant.
+    """Assignment of queries to the truth in one instant.
 
     Attributes:
         layers: pairs of each layer, tracks included; a layer that does not classify has those of the last one.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class LossWeights:
-    """How much each loss and each cost of the assignment counts, as in the paper and MapTracker; 0 leaves a loss out.
+    """Weights of the losses and of the costs of the assignment, as in the paper and MapTracker; 0 leaves a loss out.
 
     Attributes:
         focal: of the classes.
@@ -71,4 +71,4 @@ LITE_LOSSES = LossWeights(
     focal_segmentation=False,
     mean_over_frames=True,
 )
-"""What trained best on two CPU cores: on thin lines and small grids cross-entropy converges faster than dice."""
+"""Weights that trained best on two CPU cores: on thin lines and small grids cross-entropy beats dice."""
