@@ -52,12 +52,12 @@ def test_the_file_is_small():
 def test_streaming_is_at_least_as_good_as_single_frames(rendered: Rendered):
     streaming, single = mean_ap(rendered, streaming=True), mean_ap(rendered, streaming=False)
     assert streaming >= single
-    assert streaming >= 0.623  # It is 0.6264.
-    assert single >= 0.598  # It is 0.6017.
+    assert streaming >= 0.526  # It is 0.5299, by weights that were trained on the second world.
+    assert single >= 0.457  # It is 0.4610.
 
 
 def test_without_merging_tracks_and_detections_repeat_each_other(rendered: Rendered):
-    assert mean_ap(rendered, streaming=True, merge=False) < 0.623 - 0.1
+    assert mean_ap(rendered, streaming=True, merge=False) < 0.526 - 0.1
 
 
 def test_the_map_of_a_drive_is_found_and_right(rendered: Rendered):
