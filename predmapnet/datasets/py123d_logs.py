@@ -91,7 +91,7 @@ def _table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
         metadata = msgpack.unpackb((table.schema.metadata or {})[b"metadata"], strict_map_key=False)
         if not isinstance(metadata, dict):
             raise ValueError("its metadata are no dictionary")
-    except (pa.ArrowException, KeyError, ValueError) as error:
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise UserError(f"{path} is no file of py123d, or damaged: {error}.") from error
     prefix = f"{path.stem}."
     return table.rename_columns([name.removeprefix(prefix) for name in table.column_names]), metadata

@@ -82,3 +82,10 @@ def test_a_road_of_another_program_is_read_by_its_mark_and_its_crosswalk(tmp_pat
 def test_curves_of_another_program_are_told(tmp_path):
     (tmp_path / "map.xodr").write_text(ROAD.replace("<line/>", '<arc curvature="0.1"/>'))
     assert any("straight" in note for note in read_map(tmp_path / "map.xodr", PLANE).notes)
+
+
+@pytest.mark.parametrize("content", [b"", b"ARROW1", b"ARROW1\0\0" + bytes(100) + b"ARROW1"])
+def test_a_damaged_arrow_file_is_one_message(tmp_path, content):
+    (tmp_path / "map.arrow").write_bytes(content)
+    with pytest.raises(ValueError, match=r"map\.arrow: no py123d map of ours"):
+        read_map(tmp_path / "map.arrow")
