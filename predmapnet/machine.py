@@ -91,6 +91,16 @@ def _keep_freed_memory() -> None:
         libc.mallopt(trim_threshold, 2**31 - 1)
 
 
+def trim_memory() -> None:
+    """Give pages of freed memory back to the system that :func:`use_threads` keeps, for long runs now and then.
+
+    What stays of each frame lies between large tensors that come and go, and takes their places, so that they need new
+    ones: without this, a drive of 2,000 frames grows to twice its memory. It costs some hundredths of a second.
+    """
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
+
+
 def available_cores() -> int:
     """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

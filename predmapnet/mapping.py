@@ -16,6 +16,7 @@ from mapfusion.integrate.config import IntegratorConfig
 from mapfusion.integrate.integrator import MapIntegrator
 from mapfusion.road_heights import RoadHeights
 from predmapnet.errors import UserError
+from predmapnet.machine import trim_memory
 from predmapnet.scenes import Frame, Scene
 
 if TYPE_CHECKING:  # What needs no network (runs.integrate) does not load torch.
@@ -27,6 +28,9 @@ NETWORK_ERRORS = IntegratorConfig(common_deviation=0.2)
 A network with a memory repeats its error from frame to frame, so that its detections agree better with each other
 than with the truth. The common part was chosen on the validation towns of the demo world with the ``lite`` weights.
 """
+
+FRAMES_BETWEEN_TRIMS = 100
+"""So rarely that it costs nothing, and often enough that a long drive needs no more memory than a short one."""
 
 MapSnapshot = Callable[[], GlobalMap]
 """Returns the global map as it is now; its cost grows with the map, so it is for every few frames."""
@@ -155,6 +159,8 @@ def stream(
 
         upcoming = reader.submit(read, 0)
         for index in range(len(scene)):
+            if index and index % FRAMES_BETWEEN_TRIMS == 0:
+                trim_memory()
             asked = perf_counter()
             frame, images = upcoming.result()
             images_ready = perf_counter()
