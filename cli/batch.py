@@ -83,10 +83,11 @@ def batch(
     crs: Crs = None,
     force: Force = False,
 ) -> None:
-    """Map many scenes in several processes or on a cluster; run it again to resume.
+    """Map many scenes, resuming where it stopped.
 
-    Writes NAME.geojson (or another --format) and NAME.summary.json of each scene, or NAME.failed.json, and for the
-    folder summary.json and report.html, the page to look at first. The exit code is 1 if any scene failed.
+    In several processes, or on a cluster. Writes NAME.geojson (or another --format) and NAME.summary.json of each
+    scene, or NAME.failed.json, and for the folder summary.json and report.html, the page to look at first. The exit
+    code is 1 if any scene failed.
     """
     from cli.batch_display import BatchDisplay
     from cli.console import progress_display

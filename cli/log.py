@@ -52,10 +52,11 @@ def from_bag(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a log of your own from a ROS 2 bag (extra 'bags'; no ROS is needed).
+    """Make a log of your own from a ROS 2 bag.
 
-    Images, camera infos, transforms and odometry become images by camera and time, calibration.json and poses.csv.
-    `predmapnet infer FOLDER` maps them (docs/own-logs.md). What was left out or lost is said.
+    It needs the extra 'bags', and no ROS. Images, camera infos, transforms and odometry become images by camera and
+    time, calibration.json and poses.csv. `predmapnet infer FOLDER` maps them (docs/own-logs.md). What was left out or
+    lost is said.
     """
     from cli.console import progress_display
     from predmapnet.datasets.bags.conversion import BagOptions, log_from_bag
@@ -80,7 +81,10 @@ def from_py123d(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a log of your own from a log of py123d (the package is not needed)."""
+    """Make a log of your own from a py123d log.
+
+    The package is not needed.
+    """
     from cli.console import progress_display
     from predmapnet.datasets.py123d_logs import log_from_py123d
 

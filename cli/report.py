@@ -12,7 +12,10 @@ def report(
     maps: Annotated[str, typer.Argument(metavar="FOLDER|MAP", help="Folder of a batch or of maps, or one map.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Page to write (.html); it needs nothing else.")],
 ) -> None:
-    """Write a page with the city map, doubtful stretches first, and all scenes with figures and failures."""
+    """Write a page on a batch or a map.
+
+    It shows the city map, doubtful stretches first, and all scenes with figures and failures.
+    """
     from cli.console import out as screen
     from predmapnet.files import check_output, write_file
     from predmapnet.runs.fleet_report import folder_report, map_report

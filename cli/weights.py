@@ -124,7 +124,10 @@ def inspect_weights(
     names: Annotated[bool, typer.Option("--names", help="List every tensor.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Show the content of a weights file: network, modules, parts and origin."""
+    """Show what a weights file holds.
+
+    Network, modules, parts and origin.
+    """
     from cli.console import print_json
     from predmapnet.weights.inspection import inspect_file
 

@@ -47,6 +47,15 @@ def test_the_first_help_tells_the_exit_codes_and_installs_completion(predmapnet,
     assert "--install-completion" in said
 
 
+@pytest.mark.parametrize("words", [(), ("log",), ("weights",)])
+def test_what_a_command_does_is_said_in_whole_sentences(predmapnet, monkeypatch, words):
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
+    said = predmapnet(*words, "-h").out.partition("Commands:")[2]
+    assert said.count(".\n") >= 2
+    assert "..." not in said
+
+
 def test_words_are_completed():
     asked = {"_PREDMAPNET_COMPLETE": "complete_bash", "COMP_WORDS": "predmapnet inf", "COMP_CWORD": "1"}
     command = [sys.executable, "-m", "predmapnet"]
