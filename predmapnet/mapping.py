@@ -22,7 +22,7 @@ from predmapnet.scenes import Frame, Scene
 if TYPE_CHECKING:  # What needs no network (runs.integrate) does not load torch.
     from predmapnet.mapper import CameraImages, Mapper
 
-NETWORK_ERRORS = IntegratorConfig(common_deviation=0.2)
+NETWORK_ERRORS = IntegratorConfig(common_deviation=0.3)
 """Assumptions of the integrator about the networks of this package.
 
 A network with a memory repeats its error from frame to frame, so that its detections agree better with each other
