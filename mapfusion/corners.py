@@ -7,8 +7,8 @@ import shapely
 
 from mapfusion.arrays import Float
 
-SAMPLES = 80
-"""Number of places along an outline by which its sides are fitted."""
+SAMPLES = 240
+"""Number of places along an outline by which its sides are fitted: enough for the short ones of a long crossing."""
 
 ROUNDED = 0.2
 """Share of a side, at each of its ends, that may be rounded off and does not count in its fit."""

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from mapfusion.arrays import Float, Integer
 from mapfusion.elements import RegionOfInterest
 
-FARTHEST_POSE = 1e10
+FARTHEST_POSE = 1e8
 """Poses farther from the origin of their frame are none, metres; UTM takes ten million."""
 UNIT_TOLERANCE = 1e-14
 """Distance from 1 up to which a squared quaternion length counts as 1."""

@@ -13,7 +13,8 @@ def test_a_dry_run_prints_the_plan_and_makes_nothing(predmapnet, tmp_path):
     assert "lite, 4000 frames" in said
     single = next(line for line in plan.out.splitlines() if "single" in line)
     assert all(part in single for part in ("24", str(24 * (4000 // 12)), "0.00141", "GiB"))
-    assert re.search(r"cache of 2\d{4} images in \S+ takes about 0\.[2-4] GB", said)
+    unbroken = "".join(plan.out.split())
+    assert re.search(r"cacheof2\d{4}imagesin\S+takesabout0\.[2-4]GB", unbroken)
     assert not (tmp_path / "runs").exists() and not (tmp_path / "cache" / "training").exists()
 
 

@@ -43,8 +43,9 @@ class FaultyImages(SceneView):
         images = {}
         for name, path in frame.images.items():
             shot = Shot(frame.scene, index, cameras[name], self.seed)
-            images[name] = self.folder / f"{name}.bmp"
-            cv2.imwrite(str(images[name]), self.fault(read_image(path), shot, self.severity)[:, :, ::-1])
+            images[name] = self.folder / f"{name}.png"
+            faulty = self.fault(read_image(path), shot, self.severity)[:, :, ::-1]
+            cv2.imwrite(str(images[name]), faulty, [cv2.IMWRITE_PNG_COMPRESSION, 0])
         return replace(frame, images=images)
 
 

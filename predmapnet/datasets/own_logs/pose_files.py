@@ -30,8 +30,6 @@ TUM, KITTI = 8, 12
 """Numbers in a line."""
 MOVED = 3.0
 """Shorter ways up and down may be noise, metres."""
-FARTHEST = 1e8
-"""No frame of a car has its origin farther off, metres."""
 WHOLE_NANOSECONDS = re.compile("[0-9]{16,}")
 """Times of TUM and KITTI are seconds; whole numbers as long as this can only be nanoseconds."""
 
@@ -62,11 +60,6 @@ def read_timed_poses(folder: Path, camera_to_ego: Float | None = None) -> TimedP
         raise UserError(f"{path} holds no pose. {HOW}.")
     timestamps = np.array([_time(row, f"{path}, {place}") for place, row in rows], dtype=np.int64)
     poses = np.array([pose_matrix(row["rotation"], row["translation"], f"{path}, {place}") for place, row in rows])
-    far = np.flatnonzero(np.abs(poses[:, :3, 3]).max(axis=1) > FARTHEST)
-    if len(far):
-        raise UserError(
-            f"{path}, {rows[far[0]][0]}: the position {poses[far[0], :3, 3].tolist()} (metres) lies on no Earth."
-        )
     order = np.argsort(timestamps, kind="stable")
     repeated = np.flatnonzero(np.diff(timestamps[order]) == 0)
     if len(repeated):

@@ -139,7 +139,8 @@ LINE = [[-10, 2], [10, 2]]
     ("broken", "reason"),
     [
         (frame_map([LINE], ego_to_global=np.full((4, 4), np.nan), number=99), "pose is not finite"),
-        (frame_map([LINE], ego_to_global=2 * np.eye(4), number=99), "pose is not rigid"),
+        (frame_map([LINE], ego_to_global=np.diag([2.0, 2.0, 2.0, 1.0]), number=99), "pose is not rigid"),
+        (frame_map([LINE], ego_to_global=pose(1e9, 0, 0), number=99), "pose lies more than 1e+08 m away"),
         (frame_map([LINE], ego_to_global=pose(1e5, 0, 0), number=99), "pose jumps"),
         (frame_map([LINE], ego_to_global=np.eye(3), number=99), "pose is not 4 x 4"),
         (frame_map([NAN_LINE], number=99), "points not finite"),

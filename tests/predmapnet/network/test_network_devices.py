@@ -90,7 +90,7 @@ def test_a_stream_stays_on_the_gpu(name):
         gpu.put_network(network)
         state = None
         for frame in frames:
-            inputs = StageTraining(network, NUSCENES_STAGES[-1])._inputs(frame)
+            inputs = frame.inputs(network)
             outputs = network(inputs, state)
             selection = select(outputs, state, config)
             state = network.advance(state, outputs, selection.instances, inputs, selection.lost)
