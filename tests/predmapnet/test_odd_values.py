@@ -31,6 +31,7 @@ HUGE, DEEP = "9" * 400, "[" * 200 + "]" * 200
         ("nuscenes", "singapore-onenorth.json", '"x": 400.0', '"x": 1e12', "more than 1e"),
         ("nuscenes", "singapore-onenorth.json", '"x": 400.0', f'"x": {HUGE}', "OverflowError"),
         ("argoverse2", "MIA_city_1.json", '"x": 0', '"x": 1e300', "more than 1e"),
+        ("argoverse2", "MIA_city_1.json", '"id": 1', '"id": []', "has ids that are none"),
         ("log", "calibration.json", '"fx": 40.0', f'"fx": {DEEP}', "more than 100 deep"),
         ("log", "calibration.json", '"fx": 40.0', '"fx": 4000.0', "differ as those of no camera"),
         ("log", "calibration.json", '"left"', '"front"', "the name front twice"),

@@ -237,6 +237,9 @@ def _side(lane: Mapping[str, Any], points: Float, which: str) -> LaneSide | None
     neighbour = lane[f"{which}_neighbor_id"]
     if neighbour is None:
         return None
+    linked = [lane["id"], neighbour, *lane["predecessors"], *lane["successors"]]
+    if not all(isinstance(number, (int, str)) for number in linked):
+        raise ValueError(f"the lane {str(lane['id'])[:40]} has ids that are none: {str(linked)[:80]}")
     return LaneSide(lane["id"], points, neighbour, tuple(lane["predecessors"]), tuple(lane["successors"]))
 
 

@@ -204,3 +204,15 @@ def test_one_plane_for_several_maps_does_not_depend_on_their_order():
     assert common_plane(boxes) == common_plane(boxes[::-1])
     with pytest.raises(ValueError, match="not of one city"):
         common_plane(np.array([[8.40, 49.0, 8.41, 49.01], [-71.0, 42.0, -70.9, 42.1]]))
+
+
+@pytest.mark.parametrize("suffix", [".gpkg", ".fgb"])
+def test_a_file_that_sends_its_reader_elsewhere_is_no_map(tmp_path, suffix):
+    """GDAL would follow a virtual data source to any file, or to the network."""
+    secret = tmp_path / "secret.gpkg"
+    write_map(EXAMPLE, secret, PLANE)
+    source = f"<SrcDataSource>{secret}</SrcDataSource>"
+    path = tmp_path / f"map{suffix}"
+    path.write_text(f'<OGRVRTDataSource><OGRVRTLayer name="lines">{source}</OGRVRTLayer></OGRVRTDataSource>')
+    with pytest.raises(ValueError, match="neither a GeoPackage nor a FlatGeobuf"):
+        read_map(path)
