@@ -78,6 +78,8 @@ def log_differences(recording: rr.RecordingStream, path: Path) -> list[str]:
     """Draw a file that ``predmapnet diff`` wrote. Returns and raises as :func:`log_maps`."""
     try:
         found, _, told = read_diff(path)
+    except FileNotFoundError:
+        raise
     except (OSError, ValueError) as error:
         raise UserError(f"cannot show {path}: {error}") from error
     if not found.differences:
@@ -113,6 +115,8 @@ def _begin(recording: rr.RecordingStream, paths: Sequence[Path]) -> tuple[list[G
     """Read the maps and lay out the view; returns them with their plane and the middle of them all, metres."""
     try:
         maps, plane = read_maps(paths)
+    except FileNotFoundError:
+        raise
     except (OSError, ValueError) as error:
         raise UserError(f"cannot show {', '.join(map(str, paths[:3]))}: {error}") from error
     points = [element.points for found in maps for element in found]

@@ -147,3 +147,10 @@ def test_differences_that_another_program_saved_are_none_of_a_map(predmapnet, ch
     result = predmapnet("merge", "saved.gpkg", "--out", "wrong.geojson")
     assert result.code == 2
     assert "is no map" in result.err
+
+
+@pytest.mark.parametrize("name", ["nope.gpkg", "nope.geojson", "nope.osm"])
+def test_a_map_that_is_not_there_is_named(predmapnet, tmp_path, name):
+    result = predmapnet("view", tmp_path / name, "--out", tmp_path / "x.rrd")
+    assert result.code == 2
+    assert result.err.strip() == f"Error: no such file or directory ({tmp_path / name})"
