@@ -20,6 +20,9 @@ Origins: TypeAlias = Mapping[str, tuple[int, ...]]
 PAINTS = ("solid", "dashed")
 """Known paint of a divider."""
 
+LONGEST_SIDE = 2_000.0
+"""Of a region of interest, metres."""
+
 
 class ElementKind(IntEnum):
     """Kind of a map element; the numbers are the class ids of the nuScenes and Argoverse 2 benchmarks."""
@@ -58,15 +61,18 @@ class RegionOfInterest:
         width: extent along y (left), metres.
 
     Raises:
-        ValueError: a side is not a positive number.
+        ValueError: a side is not a positive number, or longer than any camera sees.
     """
 
     length: float = 60.0
     width: float = 30.0
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.length < np.inf and 0.0 < self.width < np.inf):
-            raise ValueError(f"a region of interest has two positive sides, not {self.length} m and {self.width} m")
+        if not (0.0 < self.length <= LONGEST_SIDE and 0.0 < self.width <= LONGEST_SIDE):
+            raise ValueError(
+                f"a region of interest has two positive sides of at most {LONGEST_SIDE:g} m, not {self.length} m and "
+                f"{self.width} m"
+            )
 
     @property
     def size(self) -> Float:

@@ -52,7 +52,7 @@ def edited_since_written(path: Path) -> bool:
         stored = _STORED.search(_provenance(path))
         if stored is not None:
             return stored[1].decode() != _digest(path)
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeDecodeError):  # a damaged database
         return False
     content = path.read_bytes()
     return all(name in content for name in _OURS)

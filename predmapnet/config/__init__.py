@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
-from mapfusion.elements import RegionOfInterest
+from mapfusion.elements import LONGEST_SIDE, RegionOfInterest
 from predmapnet.config.decoder import (
     DecoderConfig,
     DecoderQuirks,
@@ -68,8 +68,8 @@ class PredMapNetConfig(Section):
     """
 
     name: str = "lite"
-    roi_length: Metres = 60.0
-    roi_width: Metres = 30.0
+    roi_length: Annotated[Metres, Field(le=LONGEST_SIDE)] = 60.0
+    roi_width: Annotated[Metres, Field(le=LONGEST_SIDE)] = 30.0
     image: ImageConfig = ImageWindowConfig()
     bev: BevConfig = LookupBevConfig()
     segmentation: SegmentationConfig = SegmentationConfig()

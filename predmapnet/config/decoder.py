@@ -101,7 +101,7 @@ class MapTrackerDecoderConfig(AttentionSection):
     query_assignment: Literal["suppress"] = "suppress"
     queries: Positive = 100
     points: Annotated[int, Field(ge=2, le=1_000)] = 20
-    width: Annotated[int, Field(gt=0, multiple_of=4)] = 512
+    width: Annotated[int, Field(gt=0, le=65_536, multiple_of=4)] = 512
     heads: Few = 8
     layers: Few = 6
     hidden: Positive = 1024

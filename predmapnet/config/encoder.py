@@ -157,7 +157,7 @@ class BevFormerConfig(AttentionSection):
     kind: Literal["bevformer"] = "bevformer"
     rows: Cells = 50
     columns: Cells = 100
-    width: Annotated[int, Field(gt=0, multiple_of=2)] = 256
+    width: Annotated[int, Field(gt=0, le=65_536, multiple_of=2)] = 256
     heads: Few = 8
     layers: Few = 2
     hidden: Positive = 512

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,14 @@ def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> U
     token = record.get("token")
     which = f", record {str(token)[:60]}" if token is not None else ""
     return UserError(f"{where}{which}: the field '{name}' {found}; {expected} is expected.")
+
+
+def is_there(path: Path) -> bool:
+    """Whether a file that a table names exists; a name that no disk can hold is that of none."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def check_mounting(camera_to_ego: Float, where: str) -> None:

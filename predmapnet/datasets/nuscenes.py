@@ -17,6 +17,7 @@ from mapfusion.georeference import Georeference
 from predmapnet.datasets.fields import (
     check_mounting,
     check_principal_point,
+    is_there,
     numbers_field,
     text_field,
     whole_field,
@@ -148,8 +149,7 @@ class NuScenesSource:
         """Return the georeference of a scene; rendered towns carry a borrowed location, but lie in the ocean."""
         if not self.synthetic:
             return nuscenes_georeference(info.location)
-        path = self.root / DEMO_MARKER
-        seed = whole_field({"town_seed": 0, **read_map_file(path)[0]}, "town_seed", str(path))
+        seed = whole_field({"town_seed": 0, **read_map_file(self.root / DEMO_MARKER)[0]}, "town_seed", DEMO_MARKER)
         return demo_georeference(f"demo world, {info.name}", seed)
 
     def _ground_truth(self, location: str) -> NuScenesGroundTruth | None:
@@ -332,8 +332,8 @@ class NuScenesScene:
                 self._camera(channel, frame.sensors.get(channel, first), ego_to_shifted, index)
                 for channel, first in self._cameras.items()
             ),
-            images={channel: path for channel, path in images.items() if path.is_file()},
-            missing={channel: f"{path} does not exist" for channel, path in images.items() if not path.is_file()},
+            images={channel: path for channel, path in images.items() if is_there(path)},
+            missing={channel: f"{path} does not exist" for channel, path in images.items() if not is_there(path)},
         )
 
     def _camera(self, channel: str, record: Record, ego_to_shifted: Float, index: int) -> Camera:

@@ -172,7 +172,8 @@ def _figures(
 ) -> list[tuple[str, str, bool]]:
     reports = [outcome.report for outcome in outcomes if outcome.report is not None]
     frames, seconds = sum(r["frames"] for r in reports), sum(r["seconds"] for r in reports)
-    measured = [r["accuracy"]["mean_ap"] for r in reports if r.get("accuracy")]
+    figures_of = [(r.get("accuracy") or {}).get("mean_ap") for r in reports]
+    measured = [figure for figure in figures_of if figure is not None]
     metres = {kind: 0.0 for kind in ElementKind}
     for item in elements:
         metres[item.element.kind] += item.element.length

@@ -102,7 +102,8 @@ def read_position(checkpoint: Path) -> Position:
         position = _POSITION.validate_json((checkpoint / "position.json").read_bytes())
     except (OSError, ValidationError) as error:
         raise UserError(f"The checkpoint {checkpoint} is damaged or of another version: {error}.") from None
-    if min(position.step, position.frames, position.validated, position.metrics_bytes, *position.fall) < 0:
+    counts = (position.step, position.frames, position.validated, position.metrics_bytes, *position.fall)
+    if min(counts) < 0 or not min(position.seconds, position.total_seconds, position.cpu_seconds) >= 0.0:
         raise UserError(f"The checkpoint {checkpoint} is damaged: its position.json counts below zero.")
     return position
 

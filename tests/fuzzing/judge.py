@@ -36,6 +36,8 @@ STARTS = {
     "socket.connect",
 }
 """What Python tells of code that data could start."""
+TEMPORARY = Path(tempfile.gettempdir())
+"""Asked for here, since the hook below may be called while Python looks for it."""
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 _watched: list[tuple[Path, list[str]]] = []
@@ -163,5 +165,5 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
         told.append(f"{event} {arguments!r:.100}")
     elif event == "open" and isinstance(arguments[0], str) and arguments[2] is not None and arguments[2] & WRITES:
         path = Path(arguments[0]).absolute()
-        if not path.is_relative_to(folder) and path not in (Path(os.devnull), Path(tempfile.gettempdir())):
+        if not path.is_relative_to(folder) and path not in (Path(os.devnull), TEMPORARY):
             told.append(f"writes {arguments[0]}")

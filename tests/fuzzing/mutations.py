@@ -10,6 +10,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def json_mutated(content: bytes, generator: random.Random) -> bytes:
         parent, key = generator.choice(places)
         chosen = generator.random()
         if chosen < 0.5:
-            parent[key] = generator.choice(VALUES)
+            parent[key] = deepcopy(generator.choice(VALUES))  # later changes must not reach VALUES
         elif chosen < 0.6:
             del parent[key]
         elif chosen < 0.75:
@@ -71,7 +72,7 @@ def json_mutated(content: bytes, generator: random.Random) -> bytes:
         elif chosen < 0.9:
             parent[generator.choice(["", "x", "token", "name", "type", "@digits@"])] = parent.pop(key)
         else:
-            parent[f"{key}@again@"], repeated = generator.choice([parent[key], *VALUES]), True
+            parent[f"{key}@again@"], repeated = deepcopy(generator.choice([parent[key], *VALUES])), True
     text = json.dumps(document, indent=generator.choice([None, 1]))
     if repeated:
         text = text.replace("@again@", "")

@@ -53,11 +53,14 @@ HUGE, DEEP = "9" * 400, "[" * 200 + "]" * 200
         ("results", "streammapnet.json", '"scores": [0.9', f'"scores": [{HUGE}', "scores are not numbers"),
         ("results", "maptracker.json", '"global_ids": [3', '"global_ids": [9007199254740993', "whole numbers"),
         ("configuration", "lite.json", '"layers":2', '"layers":1000000000', "semantic_queries.layers"),
+        ("configuration", "paper-nuscenes.json", '"width":32', '"width":2147483648', "less than or equal"),
         ("configuration", "lite.json", '"roi_length":60.0', '"roi_length":Infinity', "roi_length"),
         ("configuration", "lite.json", '"decoder":{', '"quirks":[1],"decoder":{', "quirks"),
         ("configuration", "network.json", '"rows": 3', f'"rows": {DEEP}', "more than 100 deep"),
         ("training-run", "position.json", '"step": 3', '"step": "three"', "step"),
         ("training-run", "position.json", '"step": 3', '"step": -3', "below zero"),
+        ("training-run", "position.json", '"total_seconds": 0.0', '"total_seconds": -1', "below zero"),
+        ("configuration", "lite.json", '"roi_length":60.0', '"roi_length":1e9', "roi_length"),
         ("evaluations", "one.json", '"warnings": ["a note"]', '"warnings": [[]]', "must be texts"),
         ("evaluations", "one.json", '"mAP": 0.5', '"mAP": "high"', "mAP of chamfer_ap is no number"),
         ("evaluations", "one.json", '"scene-1": {', '"scene-1": [], "scene-3": {', "scene-1 is no number"),
@@ -139,3 +142,10 @@ def test_a_pose_with_rows_and_columns_exchanged_is_refused(tmp_path):
     path.write_text(json.dumps(poses))
     with pytest.raises(UserError, match="rows and columns exchanged"):
         read_poses(path)
+
+
+def test_a_scene_without_a_figure_is_no_fault_of_the_report(tmp_path):
+    """JSON has no NaN: what could not be measured is null in a record."""
+    (path, _) = READERS["records"].write(tmp_path)
+    path.write_text(path.read_text().replace('"mean_ap": 0.4', '"mean_ap": null'))
+    READERS["records"].read(tmp_path, path)

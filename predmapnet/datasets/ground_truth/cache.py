@@ -121,6 +121,8 @@ def truths_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> list[FrameTruth]:
     if [array.dtype.kind for array in found] != [*kinds_of_arrays.values()]:
         raise ValueError(f"arrays {', '.join(kinds_of_arrays)} are expected")
     lengths, points, kinds, element_ids, counts = found
+    if [array.ndim for array in found] != [1, 2, 1, 1, 1]:
+        raise ValueError("the arrays have not as many axes as they should")
     whole = len(lengths) == len(kinds) == len(element_ids) == counts.sum() and lengths.sum() == len(points)
     if not whole or points.shape != (len(points), 2) or (lengths < 0).any() or (counts < 0).any():
         raise ValueError("the arrays do not fit each other")
