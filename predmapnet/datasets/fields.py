@@ -26,12 +26,12 @@ def text_field(record: Mapping[str, Any], name: str, where: str) -> str:
 
 
 def whole_field(record: Mapping[str, Any], name: str, where: str) -> int:
-    """Return a field that is an integer. Raises UserError if it is missing, too large or something else."""
+    """Return a field that is an integer from 0 on. Raises UserError if it is missing, too large or something else."""
     value = record.get(name)
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)) or value != value // 1:
         raise _wrong(record, name, "a whole number", where)
-    if not -(2**63) <= value < 2**63:
-        raise _wrong(record, name, "a whole number of 64 bits", where)
+    if not 0 <= value < 2**63:
+        raise _wrong(record, name, "a whole number from 0 on, of 63 bits at most,", where)
     return int(value)
 
 

@@ -22,8 +22,9 @@ HUGE, DEEP = "9" * 400, "[" * 200 + "]" * 200
 @pytest.mark.parametrize(
     ("reader", "file", "old", "new", "message"),
     [
-        ("nuscenes", "demo_world.json", "7", "-1", "no town -1"),
+        ("nuscenes", "demo_world.json", "7", "-1", "from 0 on"),
         ("nuscenes", "demo_world.json", "7", "null", "'town_seed' is missing"),
+        ("nuscenes", "scene.json", '"nbr_samples": 2', '"nbr_samples": -1', "from 0 on"),
         ("nuscenes", "sample.json", "1500000000000000", "1" * 19, "'timestamp'|too large|time of frame"),
         ("nuscenes", "ego_pose.json", "500.0", HUGE, "pose needs|translation"),
         ("nuscenes", "/sensor.json", "sensor-CAM_BACK_LEFT", "sensor-CAM_BACK", "records have the token"),
