@@ -41,6 +41,24 @@ class Meter:
         return {**dict(zip(self._sums, values, strict=True)), "seconds_per_step": seconds}
 
 
+def shown(values: Mapping[str, float], position: Position, progress: float) -> str:
+    """Return a line of metrics for the screen; all of them are in the file.
+
+    Args:
+        values: means over some steps, or figures of a validation (``val_...``).
+        position: of the run.
+        progress: share of the stage that is done.
+    """
+    where = f"{position.stage} {progress:4.0%}  step {position.step}"
+    if "loss" not in values:
+        figures = {name.removeprefix("val_"): value for name, value in values.items() if "@" not in name}
+        return f"{where}  validated: " + "  ".join(f"{name} {value:.3f}" for name, value in figures.items())
+    minutes = position.seconds * (1.0 - progress) / max(progress, 1e-9) / 60
+    left = f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.0f} h"
+    pace = f"{values['seconds_per_step']:.2g} s a step"
+    return f"{where}  loss {values['loss']:.4g}  {pace}, {left} left of this stage"
+
+
 class MetricsLog:
     """Lines of metrics, and the same for TensorBoard where that is installed (``predmapnet[train]``)."""
 
@@ -62,7 +80,7 @@ class MetricsLog:
                 file.truncate(size)
 
     def write(self, values: Mapping[str, float], position: Position, progress: float) -> None:
-        """Append one line of metrics and show it."""
+        """Append one line of metrics, and show what a person asks: how far, how good, how long it still takes."""
         if not self._leads:
             return
         line: dict[str, object] = {name: getattr(position, name) for name in ("stage", "step", "frames")}
@@ -72,8 +90,7 @@ class MetricsLog:
         with self._path.open("ab") as file:
             file.write(orjson.dumps(line) + b"\n")
         self._draw(values, position)
-        shown = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
-        self._report(f"{position.stage} {progress:6.1%}  step {position.step}  frames {position.frames}  {shown}")
+        self._report(shown(values, position, progress))
 
     def _draw(self, values: Mapping[str, float], position: Position) -> None:
         """Tell TensorBoard, over frames; what an interrupted run said of later frames is forgotten."""
