@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -11,7 +10,6 @@ import rerun as rr
 from mapfusion.arrays import Float
 from mapfusion.colours import KIND_COLOURS, Colour, darker
 from mapfusion.elements import GlobalMap, MapElement
-from mapfusion.formats.foreign_values import format_timestamp
 from mapfusion.georeference import Georeference
 
 MOST_DOUBT = 0.6
@@ -43,27 +41,13 @@ def element_label(element: MapElement) -> str:
     return ", ".join(told)
 
 
-def element_values(elements: Sequence[MapElement]) -> rr.AnyValues:
-    """Return the properties of elements that a selection shows, one value an element."""
-    told = [0.0 if element.deviation is None else float(np.median(element.deviation)) for element in elements]
-    return rr.AnyValues(
-        kind=[element.kind.noun for element in elements],
-        name=[element.name for element in elements],
-        confidence=[round(element.confidence, 4) for element in elements],
-        observations=[element.observations for element in elements],
-        length_m=[round(element.length, 2) for element in elements],
-        deviation_m=[round(value, 3) for value in told],
-        first_seen=[format_timestamp(element.first_seen) for element in elements],
-        last_seen=[format_timestamp(element.last_seen) for element in elements],
-        tracks=[", ".join(map(str, element.track_ids)) for element in elements],
-        sources=[", ".join(element.sources) for element in elements],
-    )
-
-
 def map_lines(
     elements: Sequence[MapElement], origin: Float, width: float, height: float = 0.0, shade: float = 0.0
-) -> tuple[Any, ...]:
-    """Return the components of elements as lines of one entity.
+) -> rr.LineStrips3D:
+    """Return elements as lines of one entity.
+
+    The viewer shows at the pointer what differs between the elements, but only up to three components: places, colours
+    and labels. So all that is told stands in the labels.
 
     Args:
         elements: metres.
@@ -72,14 +56,13 @@ def map_lines(
         height: of the lines, metres.
         shade: share of black, for what stands behind something else.
     """
-    lines = rr.LineStrips3D(
+    return rr.LineStrips3D(
         [lifted(element.points - origin, height) for element in elements],
         colors=[darker(element_colour(element), shade) for element in elements],
         radii=rr.Radius.ui_points(width),
         labels=[element_label(element) for element in elements],
         show_labels=False,
     )
-    return (lines, element_values(elements)) if elements else (lines,)
 
 
 def log_on_earth(recording: rr.RecordingStream, entity: str, global_map: GlobalMap, place: Georeference) -> None:
@@ -91,4 +74,5 @@ def log_on_earth(recording: rr.RecordingStream, entity: str, global_map: GlobalM
             radii=rr.Radius.ui_points(2.0),
         )
         name = element.name or str(number)
-        recording.log(f"{entity}/{element.kind.label}/{name}", strings, element_values([element]), static=True)
+        told = rr.AnyValues(element=element_label(element))
+        recording.log(f"{entity}/{element.kind.label}/{name}", strings, told, static=True)

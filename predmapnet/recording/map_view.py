@@ -45,7 +45,7 @@ def log_maps(recording: rr.RecordingStream, paths: Sequence[Path]) -> list[str]:
     for name, found in zip(short_names(paths), maps, strict=True):
         inside = "map" if len(maps) == 1 else f"maps/{rr.escape_entity_path_part(name)}"
         for kind in ElementKind:
-            recording.log(f"world/{inside}/{kind.label}", *map_lines(found.of_kind(kind), origin, 1.8), static=True)
+            recording.log(f"world/{inside}/{kind.label}", map_lines(found.of_kind(kind), origin, 1.8), static=True)
         rings = [lifted(plane.from_wgs84(np.array(ring)) - origin, -0.1) for ring in _observed(found)]
         border = rr.LineStrips3D(rings, colors=OBSERVED_COLOUR, radii=rr.Radius.ui_points(1.0))
         recording.log(f"world/{inside}/observed_ground", border, static=True)

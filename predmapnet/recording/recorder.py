@@ -133,7 +133,7 @@ class SceneRecorder:
         self._log_growth(named)
         for kind in ElementKind:
             lines = map_lines(named.of_kind(kind), self._origin, width=1.4, height=-0.02)
-            self._recording.log(f"{WHOLE_MAP}/{kind.label}", *lines, static=True)
+            self._recording.log(f"{WHOLE_MAP}/{kind.label}", lines, static=True)
         if self._place is not None:
             log_on_earth(self._recording, "earth/map", named, self._place)
 
@@ -197,7 +197,7 @@ class SceneRecorder:
                 labels=now.labels,
                 show_labels=False,
             )
-            self._recording.log(f"world/ego_vehicle/tracks/{kind.label}", lines, *now.values)
+            self._recording.log(f"world/ego_vehicle/tracks/{kind.label}", lines)
             # What was forecast one frame ago for this instant is given in this instant's ego frame.
             forecasts = (before.select(before.kinds == kind).forecasts or ()) if before is not None else ()
             strips = [lifted(dash, 0.12) for points in forecasts if len(points) > 1 for dash in dashes(points)]
@@ -219,7 +219,7 @@ class SceneRecorder:
             entity = f"{GROWING_MAP}/{element.kind.label}/{element.name}"
             current[entity] = content = element.points.tobytes()
             if self._logged.get(entity) != content:
-                lines, *_ = map_lines([element], self._origin, width=1.8, shade=0.4)
+                lines = map_lines([element], self._origin, width=1.8, shade=0.4)
                 self._recording.log(entity, lines)
         for entity in self._logged.keys() - current.keys():
             self._recording.log(entity, rr.Clear(recursive=False))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import rerun as rr
 
 from mapfusion.arrays import Bool
 from mapfusion.elements import ElementKind, FrameMap
@@ -32,20 +31,6 @@ class Tracks:
             f"{ElementKind(kind).noun} {track}, score {score:.2f}, {age:.1f} s old"
             for kind, track, score, age in zip(found.kinds, found.track_ids, found.scores, self.ages, strict=True)
         ]
-
-    @property
-    def values(self) -> list[rr.AnyValues]:
-        """Properties that a selection shows, one value a track; nothing if there is no track."""
-        found = self.frame_map
-        if len(found) == 0:
-            return []
-        values = rr.AnyValues(
-            kind=[ElementKind(kind).noun for kind in found.kinds],
-            track=found.track_ids.tolist(),
-            score=np.round(found.scores, 3).tolist(),
-            age_s=[round(age, 2) for age in self.ages],
-        )
-        return [values]
 
     def select(self, mask: Bool) -> Tracks:
         """Return the tracks where ``mask`` (``(n,) bool``) is true."""

@@ -75,8 +75,6 @@ def test_a_track_says_its_kind_id_score_and_age(chunks):
     labels = values(chunks, entity, "LineStrips3D:labels")
     assert labels[0] == ["divider 7, score 0.70, 0.0 s old"]
     assert labels[2][0].endswith("1.0 s old")
-    assert values(chunks, entity, "track") == [[7], [7], [7]]
-    assert values(chunks, entity, "age_s")[2] == [1.0]
     pictures = values(chunks, "/world/ego_vehicle/CAM_FRONT/tracks", "LineStrips2D:labels")
     assert any("crossing 8, score 0.90" in label for label in pictures[0])
 
@@ -86,11 +84,23 @@ def test_the_whole_map_is_there_at_every_frame_and_says_what_it_is(chunks):
     assert chunk.is_static
     (labels,) = values(chunks, "/world/whole_map/divider", "LineStrips3D:labels")
     assert labels == ["dashed divider divider-1, confidence 0.50, 8 observations, 40 m, deviation 0.25 m"]
-    assert values(chunks, "/world/whole_map/divider", "length_m") == [[40.0]]
     (strip,) = values(chunks, "/world/way", "LineStrips3D:strips")
     np.testing.assert_allclose(strip[0][0][:2], [0.0, 0.0])
     np.testing.assert_allclose(np.linalg.norm(strip[0][-1]), 8.0, atol=1e-4)
     assert "/world/map/divider/divider-1" in chunks
+
+
+SHOWN_AT_THE_POINTER = 3
+"""The viewer shows the values of at most so many components that differ between lines, and else their number."""
+
+
+@pytest.mark.parametrize("entity", ["/world/whole_map/divider", "/world/ego_vehicle/tracks/divider"])
+def test_the_viewer_tells_at_the_pointer_what_a_line_is(chunks, entity):
+    found = {name for chunk in chunks[entity] for name in chunk.to_record_batch().schema.names}
+    alike = {"LineStrips3D:show_labels", "LineStrips3D:radii"}
+    told = {name for name in found - alike if not name.startswith(("frame", "time", "log", "rerun"))}
+    assert {"LineStrips3D:strips", "LineStrips3D:labels"} <= told
+    assert len(told) <= SHOWN_AT_THE_POINTER, told
 
 
 def test_forecasts_are_held_against_what_came(chunks):
