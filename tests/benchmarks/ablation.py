@@ -2,16 +2,17 @@
 
 Trains the network anew with one part after the other added, as in Table 4 of the paper, and with other numbers of
 histories (n, appendix), each with the same data and budget and from several seeds; prints mean and standard deviation
-over the seeds of chamfer mAP and C-mAP on the validation scenes. ``--data`` and ``--data-root`` are those of
-``predmapnet train``. What is trained or measured already in ``--out`` is not done again, so the command may be ended
-and repeated. ``lite`` learns no depth; its table ends before that.
+over the seeds of chamfer mAP and C-mAP on the validation scenes. ``--init WEIGHTS`` is the short form for ``lite``: all
+rows begin from a network that sees, without the parts that the first row lacks, and learn the temporal stage only.
+``--data`` and ``--data-root`` are those of ``predmapnet train``. What is trained or measured already in ``--out`` is not
+done again, so the command may be ended and repeated. ``lite`` learns no depth; its table ends before that.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_file
+from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.training.data.prepare import DataOptions, parse_data_sets, prepare_data
 from predmapnet.training.loop import LoopSettings
@@ -31,12 +33,12 @@ from predmapnet.training.processes import usual_devices
 from predmapnet.training.run import WEIGHTS, RunOptions, train_network
 from predmapnet.training.run_checkpoint import latest
 from predmapnet.training.validation import validate
-from predmapnet.weights.checkpoint import load_checkpoint
+from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
+from predmapnet.weights.fit import start_from
 
 HISTORIES = (2, 3, 4, 5, 6)
 FIGURES = ("mAP", "C-mAP", "ped_crossing", "divider", "boundary")
 RESULT = "result.json"
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,12 @@ def _changed(config: PredMapNetConfig, sections: dict[str, dict[str, object]]) -
     return config.model_copy(update=changed)
 
 
-def measured(options: RunOptions, say: Say) -> dict[str, float]:
+def say(line: str) -> None:
+    """Tell what is being done; the tables alone go to the standard output."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def measured(options: RunOptions) -> dict[str, float]:
     """Train and measure one network, or what is left of that.
 
     Raises:
@@ -84,7 +91,7 @@ def measured(options: RunOptions, say: Say) -> dict[str, float]:
     if not weights.exists():
         say(f"training {options.folder}")
         resume = latest(options.folder) is not None
-        if train_network(RunOptions(**{**vars(options), "resume": resume}), lambda line: say(f"  {line}")) is None:
+        if train_network(RunOptions(**{**vars(options), "resume": resume}), say) is None:
             raise KeyboardInterrupt
     _, validation = prepare_data(options.data, options.config, options.plan.devices, lambda _line: None)
     if not validation:
@@ -94,6 +101,20 @@ def measured(options: RunOptions, say: Say) -> dict[str, float]:
     with write_file(result) as draft:
         draft.write_bytes(orjson.dumps(figures))
     return figures
+
+
+def common_start(config: PredMapNetConfig, weights: Path, folder: Path) -> Path:
+    """Write what rows begin from: of some weights those that the first row's network has; the rest begins at random.
+
+    Raises:
+        UserError: the weights are not there, or do not fit.
+    """
+    network, path = PredMapNet(config), folder / "start.safetensors"
+    own = network.state_dict()
+    tensors = load_checkpoint(weights).network.state_dict()
+    start_from(network, {name: value for name, value in tensors.items() if name in own}, weights)
+    save_checkpoint(path, network, {"initial": weights.name})
+    return path
 
 
 def check_same(folder: Path, terms: str) -> None:
@@ -128,6 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, help="of each stage, instead of its epochs")
     parser.add_argument("--minutes", type=float, help="lite: of each run, instead of its epochs")
     parser.add_argument("--batch", type=int, help="as of predmapnet train")
+    parser.add_argument("--init", type=Path, help="lite: weights that all rows begin from, for the temporal stage only")
     parser.add_argument("--seeds", type=int, default=2, help="runs of each row")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--devices", type=int, help="as of predmapnet train")
@@ -145,22 +167,30 @@ def main(arguments: list[str] | None = None) -> int:
         cache = default_cache() / "training"
         data = DataOptions(sets, cache, options.towns, options.validation, options.split_scheme)
         plan = PlanOptions(devices, options.batch, 1, None, options.steps, options.minutes)
-        check_same(options.out, f"{options.preset}; {plan}; {data!r}")
-        for variant in variants(preset(options.preset)):
-            if options.only and not any(word in variant.name for word in options.only):
-                continue
+        start = "" if options.init is None else f"; temporal from {options.init.name}"
+        check_same(options.out, f"{options.preset}; {plan}; {data!r}{start}")
+        rows = [
+            variant
+            for variant in variants(preset(options.preset))
+            if not options.only or any(word in variant.name for word in options.only)
+        ]
+        if not rows:
+            raise UserError("No row has such a name. Choose words of the table, such as baseline, history or future.")
+        initial = None if options.init is None else common_start(rows[0].config, options.init, options.out)
+        for variant in rows:
             found[variant.name] = [
                 measured(
                     RunOptions(
                         variant.config,
                         data,
                         options.out / f"{variant.runs}-seed{seed}",
+                        stage="all" if initial is None else "temporal",
                         plan=plan,
                         loop=LoopSettings(seed, sync_norms=options.device == "cuda"),
                         device=options.device,
                         workers=options.workers,
-                    ),
-                    lambda line: print(line, file=sys.stderr, flush=True),
+                        initial=initial,
+                    )
                 )
                 for seed in range(options.seeds)
             ]
