@@ -4,8 +4,8 @@ Trains the network anew with one part after the other added, as in Table 4 of th
 histories (n, appendix), each with the same data and budget and from several seeds; prints mean and standard deviation
 over the seeds of chamfer mAP and C-mAP on the validation scenes. ``--init WEIGHTS`` is the short form for ``lite``: all
 rows begin from a network that sees, without the parts that the first row lacks, and learn the temporal stage only.
-``--data`` and ``--data-root`` are those of ``predmapnet train``. What is trained or measured already in ``--out`` is not
-done again, so the command may be ended and repeated. ``lite`` learns no depth; its table ends before that.
+``--data`` and ``--data-root`` are those of ``predmapnet train``. What is trained or measured already in ``--out`` is
+not done again, so the command may be ended and repeated. ``lite`` learns no depth; its table ends before that.
 """
 
 from __future__ import annotations
