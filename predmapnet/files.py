@@ -105,6 +105,5 @@ def file_name(name: str) -> str:
     """
     safe = re.sub(r"[^\w .+@()-]", "_", name)
     safe = re.sub(r"^[. ]+|[. ]+$", "_", safe)[:150] or "_"
-    if safe == name:
-        return name
-    return f"{safe}-{hashlib.sha256(name.encode(errors='surrogatepass')).hexdigest()[:8]}"
+    digest = hashlib.sha256(name.encode(errors="surrogatepass")).hexdigest()[:8]
+    return name if safe == name else f"{safe}-{digest}"

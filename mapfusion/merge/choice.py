@@ -22,10 +22,8 @@ from mapfusion.merge.contribution import Looks
 
 CELL = 5.0
 """Side of a cell, metres."""
-
 KNOWN_FRAMES = 3.0
 """Number of frames that bring 63 % of what evidence can add to a cell."""
-
 EVIDENCE = 0.25
 """The most that evidence adds to a cell, as a share of what its first look does."""
 

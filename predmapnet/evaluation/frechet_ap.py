@@ -55,8 +55,7 @@ def _leash(first: Float, second: Float, most: float, row: Float) -> float:  # pr
     """Square of the discrete Frechet distance of two lines of equally many points; infinite if above ``most``."""
     count = len(first)
     for step in range(count):
-        best_of_row = np.inf
-        diagonal = np.inf
+        best_of_row = diagonal = np.inf
         for other in range(count):
             apart = (first[step, 0] - second[other, 0]) ** 2 + (first[step, 1] - second[other, 1]) ** 2
             if step == 0:

@@ -57,17 +57,15 @@ class ResidualBevMemory(nn.Module):
         stream = torch.arange(len(chosen), device=chosen.device)[:, None]
         maps = state.bev_memory[stream, chosen].flatten(0, 1)
         motion = relative_motion(ego_to_global[:, None], state.bev_memory_pose[stream, chosen]).flatten(0, 1)
-        ones = torch.ones_like(maps[:, :1])
-        warped = warp_bev(torch.cat([maps, ones], dim=1), motion, self.roi) * valid.flatten()[:, None, None, None]
-        warped = warped.unflatten(0, chosen.shape)
+        warped = warp_bev(torch.cat([maps, torch.ones_like(maps[:, :1])], dim=1), motion, self.roi)
+        warped = (warped * valid.flatten()[:, None, None, None]).unflatten(0, chosen.shape)
         return warped[:, :, :-1].flatten(1, 2), warped[:, :, -1]
 
     def _choose(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
         """Find the nearest stored map for each distance ``(B, D)``; validity, as a map serves only one of them."""
         travelled = (state.bev_memory_pose[..., :2, 3] - ego_to_global[:, None, :2, 3]).norm(dim=-1).float()
         wanted = travelled.new_tensor(self.config.distances)
-        error = (travelled[:, None] - wanted[:, None]).abs()
-        error = error.masked_fill(~state.bev_memory_valid[:, None], torch.inf)
+        error = (travelled[:, None] - wanted[:, None]).abs().masked_fill(~state.bev_memory_valid[:, None], torch.inf)
         chosen = error.argmin(dim=-1)
         repeated = (chosen[:, :, None] == chosen[:, None, :]).tril(diagonal=-1).any(dim=-1)
         return chosen, ~repeated & state.bev_memory_valid.any(dim=1, keepdim=True)
