@@ -23,14 +23,16 @@ def read_arrays(path: Path, without: Collection[str] = ()) -> dict[str, NDArray[
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            unpacked = sum(member.file_size for member in archive.infolist())
-        if unpacked > MOST_BYTES:
-            raise ValueError(f"it would take {unpacked:,} bytes when it is unpacked")
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files if name not in without}
-        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError("a member is no array of numpy's")
-        return arrays
+            members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+            unpacked = sum(member.file_size for member in members.values())
+            if unpacked > MOST_BYTES:
+                raise ValueError(f"it would take {unpacked:,} bytes when it is unpacked")
+            arrays: dict[str, NDArray[Any]] = {}
+            for name, member in members.items():
+                if name not in without:
+                    with archive.open(member) as file:
+                        arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+            return arrays
     except FileNotFoundError:
         raise
     except Exception as error:  # a damaged file may raise anything while its headers are parsed

@@ -28,7 +28,7 @@ def make_optimiser(network: nn.Module, settings: OptimiserSettings) -> torch.opt
         for decays, decay in ((True, settings.weight_decay), (False, 0.0))
     ]
     # Not fused: on the CPU that pairs the wrong elements where a gradient's memory layout differs from its weight's.
-    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas)
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, betas=settings.betas, foreach=True)
 
 
 def _rate_of(name: str, rates: Mapping[str, float]) -> float:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.network.calibration import Calibration
-from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.kernels.matrix_product import Linear, linear
 from predmapnet.network.layers import ConvNorm, Convolution, ResidualBlock, zero_init
 from predmapnet.network.small.backbone import STRIDE
 from predmapnet.network.small.ground_lookup import GroundLookup, find_on_ground, ground_points, to_ground
@@ -29,10 +29,12 @@ class BevEncoder(nn.Module):
         assert isinstance(bev, LookupBevConfig)
         channels_in = bev.backbone.channels
         fine, middle, coarse = bev.widths
-        self.fine_grid, grid = (2 * bev.rows, 2 * bev.columns), (bev.rows, bev.columns)
-        points = [ground_points(self.fine_grid, 0.0, config.roi)]
-        points += [ground_points(grid, height, config.roi) for height in bev.further_heights]
-        self.register_buffer("points", torch.cat(points), persistent=False)
+        self.grid = grid = (bev.rows, bev.columns)
+        road = ground_points((2 * bev.rows, 2 * bev.columns), 0.0, config.roi).unflatten(0, (bev.rows, 2, -1, 2))
+        raised = [ground_points(grid, height, config.roi).unflatten(0, grid) for height in bev.further_heights]
+        # All that a cell sees lies side by side: four points of the road, and one at each further height.
+        of_cells = torch.cat([road.transpose(1, 2).flatten(2, 3), *(each[:, :, None] for each in raised)], dim=2)
+        self.register_buffer("points", of_cells.flatten(0, 2), persistent=False)
         self.points: Tensor
         self.reduce = Convolution(channels_in, fine, 2, stride=2, bias=False)
         self.heights: Linear | None = None
@@ -75,13 +77,10 @@ class BevEncoder(nn.Module):
 
     def _combined(self, found: Tensor) -> Tensor:
         """Turn the features of all points ``(B, K, C_in)`` into those of the cells ``(B, C_0, H, W)``."""
-        road = found[:, : self.fine_grid[0] * self.fine_grid[1]]
-        cells = self.reduce(road.unflatten(1, self.fine_grid).permute(0, 3, 1, 2))
-        if self.heights is None:
-            return cells
-        rows, columns = cells.shape[-2:]
-        raised = found[:, road.shape[1] :].unflatten(1, (-1, rows, columns))
-        return cells + self.heights(raised.permute(0, 2, 3, 1, 4).flatten(-2)).permute(0, 3, 1, 2)
+        weight = self.reduce.weight.permute(0, 2, 3, 1).flatten(1)
+        if self.heights is not None:
+            weight = torch.cat([weight, self.heights.weight], dim=1)
+        return linear(found.reshape(len(found), *self.grid, -1), weight).permute(0, 3, 1, 2)
 
 
 def _resize(features: Tensor, like: Tensor) -> Tensor:

@@ -98,23 +98,24 @@ def find_on_ground(
     """
     batch, cameras = calibration.camera_code.shape
     u, v, depth = _project(points, calibration)
-    width, height = calibration.image_size[:, None].unbind(-1)
+    width, height = calibration.image_size[..., None].unbind(2)
     seen = (depth > NEAREST_DEPTH) & (u >= 0) & (v >= 0) & (u < width * depth) & (v < height * depth)
+    visible = seen.transpose(1, 2)
     # Point after point, so that the entries of each row follow one another.
-    entry = seen.flatten().nonzero()[:, 0]
-    u, v, depth = (value.flatten().index_select(0, entry) for value in (u, v, depth))
+    frame, point, camera = visible.nonzero(as_tuple=True)
+    view = frame * cameras + camera
+    u, v, depth = (value.flatten().index_select(0, view * len(points) + point) for value in (u, v, depth))
     corners, shares = _bilinear(u / depth / stride - 0.5, v / depth / stride - 0.5, *feature_size)
-    frame, camera = entry // (len(points) * cameras), entry % cameras
     pixels = feature_size[0] * feature_size[1]
-    first_pixel = ((frame * cameras + camera) * pixels).int()
+    first_pixel = (view * pixels).int()
     return GroundLookup(
         gather=SparseRows(
             columns=(corners + first_pixel[:, None]).flatten(),
-            starts=row_starts(4 * seen.sum(dim=-1).flatten()),
+            starts=row_starts(4 * seen.sum(dim=1).flatten()),
             weights=shares.flatten().float(),
         ),
         pixels=batch * cameras * pixels,
-        visible=seen.float(),
+        visible=visible.float(),
     )
 
 
@@ -124,11 +125,11 @@ def row_starts(entries: Tensor) -> Tensor:
 
 
 def _project(points: Tensor, calibration: Calibration) -> tuple[Tensor, Tensor, Tensor]:
-    """Return u depth, v depth and depth, ``(B, K, N) float64`` each."""
+    """Return u depth, v depth and depth, ``(B, N, K) float64`` each."""
     matrices = calibration.ego_to_image
     at_road = matrices[..., 3] + matrices[..., 2] * calibration.ground_height[..., None]
     matrices = torch.cat([matrices[..., :3], at_road[..., None]], dim=-1)
-    u, v, depth = (points @ matrices.permute(0, 2, 3, 1)).unbind(1)
+    u, v, depth = (matrices.movedim(2, 0).flatten(0, 2) @ points.T).unflatten(0, (3, *matrices.shape[:2])).unbind(0)
     return u, v, depth
 
 
@@ -144,21 +145,24 @@ def _bilinear(x: Tensor, y: Tensor, rows: int, columns: int) -> tuple[Tensor, Te
     return corners, torch.stack(shares, dim=-1)
 
 
-class _SparseProduct(torch.autograd.Function):
-    """Multiply features with the sparse matrix; the transpose serves the backward pass."""
+class _CameraMean(torch.autograd.Function):
+    """Multiply features with the sparse matrix, and divide by how many cameras see each point ``(B * K, 1)``.
+
+    The transpose serves the backward pass.
+    """
 
     @staticmethod
-    def forward(ctx: Any, table: Tensor, lookup: GroundLookup) -> Tensor:
-        ctx.lookup = lookup
-        return lookup.gather.multiply(table)
+    def forward(ctx: Any, table: Tensor, lookup: GroundLookup, cameras: Tensor) -> Tensor:
+        ctx.lookup, ctx.cameras = lookup, cameras
+        return lookup.gather.multiply(table).div_(cameras)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return ctx.lookup.scatter.multiply(gradient.contiguous()), None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return ctx.lookup.scatter.multiply(gradient / ctx.cameras), None, None
 
 
-def _differentiable_product(table: Tensor, lookup: GroundLookup) -> Tensor:
-    return _SparseProduct.apply(table, lookup)  # type: ignore[no-untyped-call]
+def _differentiable_mean(table: Tensor, lookup: GroundLookup, cameras: Tensor) -> Tensor:
+    return _CameraMean.apply(table, lookup, cameras)  # type: ignore[no-untyped-call]
 
 
 def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> Tensor:
@@ -174,6 +178,10 @@ def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> T
     """
     features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
     table = features.permute(0, 1, 3, 4, 2).reshape(-1, features.shape[2]).to(lookup.gather.weights.dtype)
-    summed = lookup.gather.multiply(table) if not torch.is_grad_enabled() else _differentiable_product(table, lookup)
-    cameras = lookup.visible.to(summed.dtype) @ camera_valid.to(summed.dtype)[..., None]
-    return summed.unflatten(0, cameras.shape[:2]) / cameras.clamp(min=1.0)
+    seeing = lookup.visible.to(table.dtype) @ camera_valid.to(table.dtype)[..., None]
+    cameras = seeing.clamp(min=1.0).flatten(0, 1)
+    if torch.is_grad_enabled():
+        found = _differentiable_mean(table, lookup, cameras)
+    else:
+        found = lookup.gather.multiply(table).div_(cameras)
+    return found.unflatten(0, seeing.shape[:2])

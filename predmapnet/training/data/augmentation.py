@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from mapfusion.arrays import Float
+from mapfusion.arrays import Bool, Byte, Float
 from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
 from predmapnet.network.image_input import input_size
 from predmapnet.training.data.calibration_noise import CalibrationNoise, perturb_calibration
@@ -22,7 +21,7 @@ from predmapnet.training.data.photography import (
     save_and_load,
     tone_tables,
 )
-from predmapnet.training.data.scene_cache import CachedFrame, Images
+from predmapnet.training.data.scene_cache import CachedFrame
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""
@@ -70,9 +69,16 @@ def mirror(frame: CachedFrame, config: PredMapNetConfig) -> CachedFrame:
             camera_code=torch.tensor(_mirrored_codes(config))[calibration.camera_code],
         ),
         truth=replace(frame.truth, polylines=tuple(line * [1.0, -1.0] for line in frame.truth.polylines)),
-        images=np.ascontiguousarray(frame.images[:, :, ::-1]),
+        images=_flipped(frame.images),
         depth=depth,
     )
+
+
+def _flipped(images: Byte) -> Byte:
+    """Swap left and right of images ``(N, h, w, 3)``; OpenCV does it forty times as fast as numpy."""
+    if not images.size:
+        return images
+    return np.asarray(cv2.flip(images.reshape(-1, *images.shape[2:]), 1), np.uint8).reshape(images.shape)
 
 
 def _mirrored_codes(config: PredMapNetConfig) -> list[int]:
@@ -92,17 +98,18 @@ def augment(
     return replace(frame, images=images, camera_valid=valid, calibration=calibration)
 
 
-def change_light(images: Images, settings: AugmentationSettings, generator: np.random.Generator) -> Images:
+def change_light(images: Byte, settings: AugmentationSettings, generator: np.random.Generator) -> Byte:
     """Take the photographs of one frame ``(N, h, w, 3)`` again, in other light and by other lenses and sensors."""
     look = settings.photography
     changed = np.stack([add_stray_light(image, look, generator) for image in images])
     changed = blur(changed, look, generator)
     tables = tone_tables(len(images), look, generator)
-    changed = np.stack([cv2.LUT(image, tables[index][None]) for index, image in enumerate(changed)])
+    for image, table in zip(changed, tables, strict=True):
+        cv2.LUT(image, table[None], image)
     return save_and_load(add_noise(changed, look, generator), look, generator)
 
 
-def cover_grid(images: Images, probability: float, config: ImageConfig, generator: np.random.Generator) -> Images:
+def cover_grid(images: Byte, probability: float, config: ImageConfig, generator: np.random.Generator) -> Byte:
     """Cover the squares of a grid with the mean colour (GridMask, Chen et al. 2020), alike in all cameras of a frame.
 
     Half of each period is covered in either direction, as in MapTracker's training: a quarter of the image.
@@ -118,9 +125,7 @@ def cover_grid(images: Images, probability: float, config: ImageConfig, generato
     return covered
 
 
-def drop_camera(
-    valid: NDArray[np.bool_], settings: AugmentationSettings, generator: np.random.Generator
-) -> NDArray[np.bool_]:
+def drop_camera(valid: Bool, settings: AugmentationSettings, generator: np.random.Generator) -> Bool:
     """Return which cameras ``(N,) bool`` still work when one of them may have failed; the last one never does."""
     working = np.flatnonzero(valid)
     if generator.random() >= settings.camera_dropout or len(working) < 2:

@@ -6,14 +6,14 @@ light, exposed, clipped and encoded with another tone curve, by one table per ca
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Images = NDArray[np.uint8]
+from mapfusion.arrays import Byte, Float32
 
 DISPLAY_GAMMA = 2.2
 EXTREME_SHARE = 0.45
@@ -57,7 +57,7 @@ class PhotographySettings:
     dirt: float = 0.06
 
 
-def tone_tables(cameras: int, settings: PhotographySettings, generator: np.random.Generator) -> Images:
+def tone_tables(cameras: int, settings: PhotographySettings, generator: np.random.Generator) -> Byte:
     """Draw how stored values change: ``(cameras, 256, 3) uint8``, from a byte to a byte."""
     exposure = _exposure(settings, generator) + settings.camera_exposure * generator.standard_normal((cameras, 1, 1))
     balance = settings.colour * generator.standard_normal((1, 1, 3))
@@ -69,13 +69,11 @@ def tone_tables(cameras: int, settings: PhotographySettings, generator: np.rando
     over = np.maximum(linear - knee, 0.0)
     room = 1.0 - knee
     soft = np.minimum(linear, knee) + (room * -np.expm1(-over / room) if room > 0 else 0.0)
-    display = np.clip(soft, 0.0, 1.0) ** (1 / DISPLAY_GAMMA)
     gamma, contrast = np.exp(settings.tone * generator.standard_normal(2) * [1.0, 1.6])
-    display = display**gamma
     pivot = 0.45
-    display = pivot + (display - pivot) * (contrast if settings.tone > 0 else 1.0)
+    display = pivot + (np.clip(soft, 0.0, 1.0) ** (gamma / DISPLAY_GAMMA) - pivot) * contrast
     levels = display * 255 + generator.uniform(-1, 1) * settings.offset
-    tables: Images = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    tables: Byte = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
     return tables
 
 
@@ -86,45 +84,40 @@ def _exposure(settings: PhotographySettings, generator: np.random.Generator) -> 
     return settings.exposure * share
 
 
-def add_stray_light(
-    image: NDArray[np.uint8], settings: PhotographySettings, generator: np.random.Generator
-) -> NDArray[np.uint8]:
+def add_stray_light(image: Byte, settings: PhotographySettings, generator: np.random.Generator) -> Byte:
     """Add shadows on the ground, veils of light, and dirt on the lens to one camera's image ``(h, w, 3)``."""
     shadow, veil, dirt = generator.random(3) < [settings.shadow, settings.veil, settings.dirt]
     height, width = image.shape[:2]
     if shadow:
         mask = _shadow_mask(height, width, generator)
-        image = cv2.multiply(image, cv2.merge([mask] * 3), scale=1 / 255)  # type: ignore[assignment]
+        image = np.asarray(cv2.multiply(image, cv2.merge([mask] * 3), scale=1 / 255), np.uint8)
     if veil:
         strength = _spot(height, width, generator.uniform(0.4, 1.5), generator) * generator.uniform(0.2, 0.7)
-        colour = generator.uniform(150, 255) * np.exp(generator.normal(0, 0.06, 3))
-        image = _blend(image, np.broadcast_to(colour, image.shape), strength)
+        colour = np.minimum(generator.uniform(150, 255) * np.exp(generator.normal(0, 0.06, 3)), 255)
+        image = np.asarray(cv2.blendLinear(image, np.full_like(image, colour), 1 - strength, strength), np.uint8)
     if dirt:
-        strength = np.zeros((height, width), dtype=np.float32)
+        strength = np.zeros((height, width), np.float32)
         for _ in range(int(generator.integers(1, 5))):
             strength = np.maximum(strength, _spot(height, width, generator.uniform(0.05, 0.25), generator))
-        smeared = cv2.blur(image, (2 * (width // 24) + 1, 2 * (height // 16) + 1)) * generator.uniform(0.4, 1.0)
-        image = _blend(image, smeared, np.minimum(1.0, 1.6 * strength) * generator.uniform(0.5, 0.95))
+        smeared = cv2.blur(image, (2 * (width // 24) + 1, 2 * (height // 16) + 1))
+        smeared = cv2.convertScaleAbs(smeared, alpha=generator.uniform(0.4, 1.0))
+        strength = np.minimum(1.0, 1.6 * strength) * generator.uniform(0.5, 0.95)
+        image = np.asarray(cv2.blendLinear(image, smeared, 1 - strength, strength), np.uint8)
     return image
-
-
-def _blend(image: NDArray[np.uint8], other: NDArray[np.floating], strength: Float32) -> NDArray[np.uint8]:
-    mixed = image + strength[:, :, None] * (other - image)
-    return np.clip(mixed, 0, 255).astype(np.uint8)
 
 
 def _spot(height: int, width: int, size: float, generator: np.random.Generator) -> Float32:
     """A soft spot anywhere in the image, 1 in its middle, ``(h, w)``; ``size`` in image widths."""
     x, y = generator.uniform(0, width), generator.uniform(-0.3, 1.0) * height
-    stretch, turn = np.exp(generator.normal(0, 0.4)), generator.uniform(0, np.pi)
+    stretch, turn = math.exp(generator.normal(0, 0.4)), generator.uniform(0, math.pi)
     columns, rows = np.arange(width, dtype=np.float32)[None] - x, np.arange(height, dtype=np.float32)[:, None] - y
-    along = (np.cos(turn) * columns + np.sin(turn) * rows) / (0.5 * size * width * stretch)
-    across = (np.cos(turn) * rows - np.sin(turn) * columns) / (0.5 * size * width / stretch)
-    spot: Float32 = np.exp(-(along * along + across * across)).astype(np.float32)
+    along = (math.cos(turn) * columns + math.sin(turn) * rows) / (0.5 * size * width * stretch)
+    across = (math.cos(turn) * rows - math.sin(turn) * columns) / (0.5 * size * width / stretch)
+    spot: Float32 = np.exp(-(along * along + across * across))
     return spot
 
 
-def _shadow_mask(height: int, width: int, generator: np.random.Generator) -> NDArray[np.uint8]:
+def _shadow_mask(height: int, width: int, generator: np.random.Generator) -> Byte:
     """Light left under shadows of poles, wires, trees and walls, ``(h, w)``, 255 where there is none."""
     mask = np.full((height, width), 255, dtype=np.uint8)
     horizon = 0.3 * height
@@ -151,53 +144,59 @@ def _shadow_mask(height: int, width: int, generator: np.random.Generator) -> NDA
     return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if generator.random() < 0.5 else mask
 
 
-def blur(images: Images, settings: PhotographySettings, generator: np.random.Generator) -> Images:
+def blur(images: Byte, settings: PhotographySettings, generator: np.random.Generator) -> Byte:
     """Blur by defocus or motion, the same for all cameras, or for one that is out of focus."""
     if generator.random() >= settings.blur:
         return images
-    kernel = _blur_kernel(generator, images.shape[2] / 256)
-    chosen = range(len(images)) if generator.random() < 0.7 else [int(generator.integers(len(images)))]
+    scale = images.shape[2] / 256
+    narrow, wide = generator.uniform([0.35, 0.8], [0.8, 2.2]) * scale
+    kernel = _motion_kernel(narrow, wide, generator.normal(0, 0.25)) if generator.random() < 0.5 else None
     blurred = images.copy()
-    for index in chosen:
-        blurred[index] = cv2.filter2D(images[index], -1, kernel, borderType=cv2.BORDER_REPLICATE)
+    for index in range(len(images)) if generator.random() < 0.7 else [int(generator.integers(len(images)))]:
+        if kernel is None:
+            cv2.GaussianBlur(images[index], (0, 0), narrow, blurred[index], borderType=cv2.BORDER_REPLICATE)
+        else:
+            cv2.filter2D(images[index], -1, kernel, blurred[index], borderType=cv2.BORDER_REPLICATE)
     return blurred
 
 
-def _blur_kernel(generator: np.random.Generator, scale: float) -> Float32:
-    """A round or a long kernel, its size in pixels growing with the image."""
-    reach = max(2, round(4 * scale))
+def _motion_kernel(narrow: float, wide: float, turn: float) -> Float32:
+    """A long kernel, turned from the horizontal by some radians; widths are standard deviations, pixels."""
+    reach = max(2, round(1.8 * wide))
     rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float32)
-    narrow = generator.uniform(0.35, 0.8) * scale
-    wide = narrow if generator.random() < 0.5 else generator.uniform(0.8, 2.2) * scale
-    turn = generator.normal(0, 0.25)
     along, across = np.cos(turn) * columns + np.sin(turn) * rows, np.cos(turn) * rows - np.sin(turn) * columns
     kernel = np.exp(-0.5 * ((along / wide) ** 2 + (across / narrow) ** 2))
     normalised: Float32 = (kernel / kernel.sum()).astype(np.float32)
     return normalised
 
 
-def add_noise(images: Images, settings: PhotographySettings, generator: np.random.Generator) -> Images:
-    """Add noise, strong in few frames. One draw serves all cameras, each at its own offset: that halves its cost."""
+def add_noise(images: Byte, settings: PhotographySettings, generator: np.random.Generator) -> Byte:
+    """Add noise, strong in few frames; all cameras have the same grains, each at places of its own."""
     deviation = settings.noise * generator.random() ** 2
     if deviation < 0.3:
         return images
-    shape = images.shape[1:]
-    grain = generator.standard_normal(shape, dtype=np.float32) * np.float32(deviation)
+    shape, size = images.shape[1:], images[0].size
+    start = generator.integers(size)
+    grain = _grains(size)[start : start + size].reshape(shape) * np.float32(deviation)
     if generator.random() < 0.3:
         # Noise reduction and demosaicing leave it in coarse grains.
         grain = np.asarray(cv2.GaussianBlur(grain, (3, 3), 0.8), dtype=np.float32) * 1.8
     if generator.random() < 0.4:
         grain[:] = grain[:, :, :1]
-    flat = np.rint(grain).astype(np.int16).ravel()
-    shifts = generator.integers(0, flat.size // 3, len(images)) * 3
+    twice = np.tile(np.rint(grain).astype(np.int16).ravel(), 2)
     noisy = np.empty_like(images)
-    for index, shift in enumerate(shifts):
-        total = cv2.add(images[index].astype(np.int16), np.roll(flat, shift).reshape(shape))
-        noisy[index] = np.clip(total, 0, 255)
+    for index, shift in enumerate(generator.integers(0, size // 3, len(images)) * 3):
+        cv2.add(images[index], twice[shift : shift + size].reshape(shape), noisy[index], dtype=cv2.CV_8U)
     return noisy
 
 
-def save_and_load(images: Images, settings: PhotographySettings, generator: np.random.Generator) -> Images:
+@cache
+def _grains(size: int) -> Float32:
+    """Normal noise for two images of that size: drawing it for every frame costs more than all else about noise."""
+    return np.random.default_rng(0).standard_normal(2 * size, dtype=np.float32)
+
+
+def save_and_load(images: Byte, settings: PhotographySettings, generator: np.random.Generator) -> Byte:
     """Sharpen, lower the resolution and compress, the same for all cameras of a frame."""
     sharper, smaller, packed = generator.random(3) < [settings.sharpening, settings.resolution, settings.jpeg]
     amount, share = float(generator.uniform(0.2, 1.2)), float(generator.uniform(0.45, 0.9))
@@ -206,16 +205,14 @@ def save_and_load(images: Images, settings: PhotographySettings, generator: np.r
         return images
     changed = images.copy()
     height, width = images.shape[1:3]
-    for index, image in enumerate(images):
-        picture = image
+    for picture in changed:
         if sharper:
-            soft = cv2.GaussianBlur(picture, (0, 0), 1.0)
-            picture = np.asarray(cv2.addWeighted(picture, 1 + amount, soft, -amount, 0), dtype=np.uint8)
+            cv2.addWeighted(picture, 1 + amount, cv2.GaussianBlur(picture, (0, 0), 1.0), -amount, 0, picture)
         if smaller:
             small = cv2.resize(picture, (round(width * share), round(height * share)), interpolation=cv2.INTER_AREA)
-            picture = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+            cv2.resize(small, (width, height), picture, interpolation=cv2.INTER_LINEAR)
         if packed:
-            _, encoded = cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-            picture = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), dtype=np.uint8)[:, :, ::-1]
-        changed[index] = picture
+            colours = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+            _, encoded = cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            picture[:] = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB))
     return changed
