@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 from dataclasses import dataclass
@@ -112,6 +113,13 @@ def workers_that_fit(device: str) -> int:
         return 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return max(1, min(available_cores() - 1, memory // WORKER_MEMORY))
+
+
+def begin_loading(_worker: int = 0) -> None:
+    """Prepare a process that makes data: one thread, an end with its parent, and Ctrl-C left to that."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    use_threads(1)
 
 
 def end_with_parent() -> None:

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from predmapnet.datasets.undistortion import Lens
 
 Image = NDArray[np.uint8]
+Report = Callable[[str], None]
+"""Sink of lines for the user."""
+
 Progress = Callable[[int, int, str], None]
 """Callback ``progress(done, total, what)`` of a long preparation."""
 

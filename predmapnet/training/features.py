@@ -10,10 +10,10 @@ import torch
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.scenes import Report
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.streams import FeatureStore
-from predmapnet.training.settings import Report
 
 ENCODERS = ("image_backbone", "bev_encoder")
 ENCODE_BATCH = 4

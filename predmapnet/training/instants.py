@@ -18,6 +18,7 @@ from torch.utils.checkpoint import checkpoint
 
 from mapfusion.elements import ElementKind
 from predmapnet.config import BevFormerConfig
+from predmapnet.frame_cache.depth_targets import UNKNOWN
 from predmapnet.network.ego_motion import relative_motion, relative_pose
 from predmapnet.network.maptracker.bev_memory import store_bev_map
 from predmapnet.network.maptracker.decoder import MapTrackerDecoder
@@ -26,7 +27,6 @@ from predmapnet.network.state import BevFeatures, FrameInputs, FrameOutputs, Ins
 from predmapnet.network.track_propagation import PoseTrackPropagation
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.training.data.batches import Batch, StreamSegment
-from predmapnet.training.data.depth_targets import UNKNOWN
 from predmapnet.training.losses.frame import LossSums, add_forecasts, add_layers
 from predmapnet.training.losses.matching import Matched, Truth, best_order, match
 from predmapnet.training.losses.terms import depth_loss, segmentation_losses, transformation_losses

@@ -24,6 +24,7 @@ from predmapnet.errors import UserError
 from predmapnet.network.kernels.low_precision import keep_places_exact
 from predmapnet.network.kernels.synced_norm import share_statistics
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.scenes import Report
 from predmapnet.training import run_checkpoint
 from predmapnet.training.data.batches import StreamSegment
 from predmapnet.training.instants import StageTraining
@@ -31,7 +32,7 @@ from predmapnet.training.metrics import Meter, MetricsLog
 from predmapnet.training.optimiser import WeightAverage, learning_rate, make_optimiser
 from predmapnet.training.plan import PlannedStage
 from predmapnet.training.run_checkpoint import Position, below_prefix, with_prefix
-from predmapnet.training.settings import Report, Stage
+from predmapnet.training.settings import Stage
 from predmapnet.training.stage_data import StageData
 from predmapnet.weights.checkpoint import save_checkpoint
 from predmapnet.weights.fit import load_weights

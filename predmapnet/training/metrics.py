@@ -11,8 +11,8 @@ import orjson
 import torch
 from torch import Tensor
 
+from predmapnet.scenes import Report
 from predmapnet.training.run_checkpoint import Position
-from predmapnet.training.settings import Report
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter

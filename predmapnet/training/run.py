@@ -12,18 +12,19 @@ from rich.table import Table
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
+from predmapnet.frame_cache.fill_cache import expected_bytes
+from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.scenes import Report
 from predmapnet.training import run_checkpoint
 from predmapnet.training.data.draws import TrainingScenes
-from predmapnet.training.data.fill_cache import expected_bytes
 from predmapnet.training.data.prepare import DataOptions, count_frames, prepare_data
-from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.dry_run import plan_table
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
 from predmapnet.training.processes import by_torchrun, check_devices, in_processes, leads
-from predmapnet.training.settings import Report, Stage, choose_stages
+from predmapnet.training.settings import Stage, choose_stages
 from predmapnet.training.stage_data import StageData
 from predmapnet.training.validation import validate
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint

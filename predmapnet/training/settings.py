@@ -5,7 +5,7 @@ Where the paper is silent, numbers are MapTracker's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -15,9 +15,6 @@ from predmapnet.errors import UserError
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.losses.weights import LITE_LOSSES, PAPER_LOSSES, LossWeights
-
-Report = Callable[[str], None]
-"""Sink of lines for the user."""
 
 
 @dataclass(frozen=True)

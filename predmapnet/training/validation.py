@@ -11,11 +11,11 @@ from mapfusion.elements import FrameMap
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.consistency_ap import consistency_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.track_selection import select
 from predmapnet.training.data.batches import collate_frames
-from predmapnet.training.data.scene_cache import CachedScene
 
 EVERY = 4
 """Every fourth frame is measured: neighbours look alike."""

@@ -27,6 +27,7 @@ from predmapnet.errors import value_errors_told
 from predmapnet.evaluation.comparison import compare_evaluations
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.export.onnx_files import ABOUT, read_graph_folder
+from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.frame_files.parquet import StoredFrame, read_frames, stored_scenes, write_frames
 from predmapnet.frame_files.pose_file import read_poses
 from predmapnet.frame_files.submission import read_submission
@@ -40,7 +41,6 @@ from predmapnet.runs.output_folder import OutputFolder
 from predmapnet.runs.scene_choice import read_manifest
 from predmapnet.scenes import FrameTruth, SceneSource
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.optimiser import make_optimiser
 from predmapnet.training.settings import OptimiserSettings
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint

@@ -11,9 +11,9 @@ from predmapnet.demo_world.catalogue import trajectory, vector_map
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.demo_world.truth import truth_from_vector_map
 from predmapnet.evaluation.global_map import THRESHOLDS, global_map_quality, seen_area
+from predmapnet.frame_cache.fill_cache import cache_demo_scene
+from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.validation import map_frames, validate
 from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED

@@ -11,6 +11,7 @@ import torch
 
 from mapfusion.arrays import Bool, Byte, Float
 from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
+from predmapnet.frame_cache.scene_cache import CachedFrame
 from predmapnet.network.image_input import input_size
 from predmapnet.training.data.calibration_noise import CalibrationNoise, perturb_calibration
 from predmapnet.training.data.photography import (
@@ -21,7 +22,6 @@ from predmapnet.training.data.photography import (
     save_and_load,
     tone_tables,
 )
-from predmapnet.training.data.scene_cache import CachedFrame
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""

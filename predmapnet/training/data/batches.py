@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from predmapnet.config import PredMapNetConfig
+from predmapnet.frame_cache.scene_cache import CachedFrame
 from predmapnet.network.calibration import Calibration, collate_calibrations, pad_cameras
 from predmapnet.network.image_input import normalise_images
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures, FrameInputs
-from predmapnet.training.data.scene_cache import CachedFrame
 from predmapnet.training.data.targets import Targets, truth_targets
 
 RASTER_GRID = (100, 200)
@@ -31,7 +31,7 @@ class Batch:
         ego_to_global: ``(B, 4, 4) float64``.
         calibration: of the cameras.
         targets: truth of these frames.
-        depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.training.data.depth_targets.depth_of_frame`, or None.
+        depth: ``(B, N, h', w') int64`` of :func:`~predmapnet.frame_cache.depth_targets.depth_of_frame`, or None.
     """
 
     images: Tensor

@@ -6,7 +6,6 @@ on with the same frames, and two processes see what one would have seen with the
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -21,10 +20,10 @@ from torch.utils.data import DataLoader, Dataset
 from mapfusion.arrays import Float
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.machine import end_with_parent, use_threads
+from predmapnet.frame_cache.scene_cache import CachedFrame, CachedScene
+from predmapnet.machine import begin_loading
 from predmapnet.training.data.augmentation import AugmentationSettings, augment, mirror
 from predmapnet.training.data.batches import StreamSegment, collate_frames
-from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 
 CROSSING_WEIGHT = 2.5
 """Times that a frame with a crossing is seen in an epoch of single frames, since crossings are rare: all of them twice,
@@ -179,10 +178,3 @@ def step_loader(
         worker_init_fn=begin_loading,
         generator=torch.Generator(),
     )
-
-
-def begin_loading(_worker: int = 0) -> None:
-    """Prepare a process that loads: one thread, an end with its parent, and Ctrl-C left to that."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
-    use_threads(1)

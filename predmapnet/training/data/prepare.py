@@ -15,12 +15,11 @@ from predmapnet.demo_world.catalogue import WORLD_VERSION, scene_infos
 from predmapnet.demo_world.source import DEMO
 from predmapnet.demo_world.training_drive import training_rig
 from predmapnet.errors import UserError
-from predmapnet.scenes import SceneInfo
+from predmapnet.frame_cache.fill_cache import fill_from_source, fill_with_demo
+from predmapnet.frame_cache.scene_cache import INDEX, CachedScene
+from predmapnet.scenes import Report, SceneInfo
 from predmapnet.sources import DATASETS, open_source
 from predmapnet.training.data.draws import TrainingScenes
-from predmapnet.training.data.fill_cache import fill_from_source, fill_with_demo
-from predmapnet.training.data.scene_cache import INDEX, CachedScene
-from predmapnet.training.settings import Report
 
 TRAINABLE = tuple(name for name in DATASETS if name != "demo-v1")
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from predmapnet.files import write_file
+from predmapnet.frame_cache.scene_cache import CachedFrame, CachedScene
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import FrameTruth
 from predmapnet.training.data.augmentation import AugmentationSettings, disturb_pose
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.data.draws import EpochOrder, TrainingScenes
-from predmapnet.training.data.scene_cache import CachedFrame, CachedScene
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import StreamSettings
 

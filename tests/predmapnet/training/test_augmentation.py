@@ -8,6 +8,7 @@ import torch
 
 from mapfusion.geometry import inverse_pose, transform_points
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.frame_cache.scene_cache import CachedFrame
 from predmapnet.network.calibration import calibrate
 from predmapnet.presets import preset
 from predmapnet.scenes import FrameTruth
@@ -21,7 +22,6 @@ from predmapnet.training.data.augmentation import (
 )
 from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.data.photography import PhotographySettings
-from predmapnet.training.data.scene_cache import CachedFrame
 from tests.predmapnet.network.mirrored_rig import mirror_rig
 
 LITE, PAPER = preset("lite"), preset("paper-nuscenes")

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from predmapnet.config import DepthConfig
 from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.training.data.depth_targets import UNKNOWN, depth_targets
+from predmapnet.frame_cache.depth_targets import UNKNOWN, depth_targets
 from predmapnet.training.losses.terms import depth_loss
 from tests.predmapnet.network.maptracker_reference import FOLDER
 

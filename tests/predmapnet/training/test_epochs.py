@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from predmapnet.errors import UserError
+from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.state import BevFeatures
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, TrainingScenes, step_loader
-from predmapnet.training.data.scene_cache import CachedScene
 from predmapnet.training.data.streams import FeatureStore, Streams
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.settings import StreamSettings

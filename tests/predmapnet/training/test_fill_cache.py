@@ -10,8 +10,8 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.catalogue import SPLITS, look_of
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.demo_world.rigs import sample_rig
-from predmapnet.training.data.fill_cache import cache_demo_scene
-from predmapnet.training.data.scene_cache import CachedScene
+from predmapnet.frame_cache.fill_cache import cache_demo_scene
+from predmapnet.frame_cache.scene_cache import CachedScene
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
+from predmapnet.frame_cache.scene_cache import CachedScene, frame_path, read_arrays, write_arrays
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.prepare import DataOptions, DataSet
-from predmapnet.training.data.scene_cache import CachedScene, frame_path, read_arrays, write_arrays
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlanOptions

@@ -16,11 +16,12 @@ from predmapnet.datasets.nuscenes import NuScenesSource
 from predmapnet.datasets.splits import split_names
 from predmapnet.demo_world.rigs import sample_rig
 from predmapnet.errors import UserError
+from predmapnet.frame_cache.fill_cache import expected_bytes
+from predmapnet.frame_cache.scene_cache import INDEX, CachedScene
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import stack_windows
 from predmapnet.presets import preset
 from predmapnet.scenes import SceneInfo
-from predmapnet.training.data.fill_cache import expected_bytes
 from predmapnet.training.data.prepare import (
     DataOptions,
     DataSet,
@@ -30,7 +31,6 @@ from predmapnet.training.data.prepare import (
     parse_data_sets,
     prepare_data,
 )
-from predmapnet.training.data.scene_cache import INDEX, CachedScene
 from tests.predmapnet.datasets.conftest import write_nuscenes
 
 CONFIG = preset("lite")
@@ -150,7 +150,7 @@ def test_missing_and_broken_images_mask_their_cameras_and_the_frame_stays(town, 
 
 def test_a_killed_filling_goes_on(town, tmp_path):
     code = (
-        "import sys, time; from pathlib import Path; from predmapnet.training.data import fill_cache\n"
+        "import sys, time; from pathlib import Path; from predmapnet.frame_cache import fill_cache\n"
         "from predmapnet.training.data.prepare import DataOptions, DataSet, prepare_data\n"
         "from predmapnet.presets import preset\n"
         "write = fill_cache.write_arrays\n"

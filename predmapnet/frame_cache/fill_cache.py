@@ -1,4 +1,4 @@
-"""Fill the training cache: any data set, frame by frame, and demo towns, drawn straight at the network's size."""
+"""Fill the cache of frames: any data set, frame by frame, and demo towns, drawn straight at the network's size."""
 
 from __future__ import annotations
 
@@ -21,12 +21,8 @@ from predmapnet.datasets.images import read_image
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.demo_world.training_drive import training_drive
 from predmapnet.errors import UserError
-from predmapnet.network.calibration import calibrate
-from predmapnet.network.image_input import stack_windows, window_camera
-from predmapnet.scenes import Frame, FrameTruth, Image, Scene, SceneSource
-from predmapnet.training.data.depth_targets import depth_of_frame
-from predmapnet.training.data.draws import begin_loading
-from predmapnet.training.data.scene_cache import (
+from predmapnet.frame_cache.depth_targets import depth_of_frame
+from predmapnet.frame_cache.scene_cache import (
     INDEX,
     JPEG_OPTIONS,
     CachedScene,
@@ -35,7 +31,10 @@ from predmapnet.training.data.scene_cache import (
     frame_path,
     write_arrays,
 )
-from predmapnet.training.settings import Report
+from predmapnet.machine import begin_loading
+from predmapnet.network.calibration import calibrate
+from predmapnet.network.image_input import stack_windows, window_camera
+from predmapnet.scenes import Frame, FrameTruth, Image, Report, Scene, SceneSource
 
 REPORT_SECONDS = 10.0
 BYTES_PER_IMAGE, BYTES_PER_PIXEL = 5000, 0.25
