@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mapfusion.array_files import read_arrays
 from mapfusion.arrays import Float
+from predmapnet.config import BevFormerConfig, PredMapNetConfig
 from predmapnet.datasets.ground_truth.cache import truth_arrays, truths_of_arrays
 from predmapnet.errors import UserError
 from predmapnet.files import write_file
@@ -54,6 +55,20 @@ class CachedFrame:
     images: Images
     camera_valid: NDArray[np.bool_]
     depth: NDArray[np.int64] | None = None
+
+
+def cache_folder(cache: Path, dataset: str, config: PredMapNetConfig) -> Path:
+    """Name the cache of a data set by all that images, codes of cameras, truth and depth depend on.
+
+    Args:
+        cache: folder of all caches.
+        dataset: its name, with what tells it from others of that name.
+        config: of the network.
+    """
+    depth = f" {config.depth} {config.bev.kind}" if config.depth.enabled else ""
+    codes = f" {config.bev.cameras}" if isinstance(config.bev, BevFormerConfig) else ""
+    key = f"{config.image} {config.bev.kind} {config.roi_length} {config.roi_width}{depth}{codes}"
+    return cache / f"{dataset}-{config.image.width}x{config.image.height}-{sha256(key.encode()).hexdigest()[:8]}"
 
 
 def frame_path(folder: Path, number: int) -> Path:

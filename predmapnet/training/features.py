@@ -38,14 +38,10 @@ def feature_shapes(network: PredMapNet) -> tuple[tuple[int, ...], ...]:
 def fill_features(
     network: PredMapNet, scenes: TrainingScenes, folder: Path, rank: int, size: int, report: Report
 ) -> FeatureStore:
-    """Encode the scenes that are not stored yet, shared out over the processes.
+    """Encode the scenes that are not stored yet, shared out over the processes (``rank`` of ``size``).
 
-    Args:
-        network: whose encoders are used; left in evaluation mode.
-        scenes: to encode.
-        folder: below which a folder is named after the encoders, so that features of others are never mixed in.
-        rank, size: which process of how many.
-        report: gets a line now and then.
+    A folder below ``folder`` is named after the encoders, so that features of others are never mixed in. The network
+    is left in evaluation mode.
     """
     config = network.config
     digest = sha256(f"{config.image} {config.bev} {config.roi}".encode())

@@ -38,21 +38,13 @@ def _rate_of(name: str, rates: Mapping[str, float]) -> float:
 
 
 def learning_rate(step: int, fall: tuple[int, int] | None, peak: float, settings: OptimiserSettings) -> float:
-    """Warm up on a line, then fall along a cosine.
-
-    Args:
-        step: optimiser steps of this stage so far.
-        fall: steps at which the cosine begins and ends; None while that is open.
-        peak: for the whole batch of the run.
-        settings: of the warm-up and of the end.
-    """
+    """Warm up to the ``peak`` on a line, then fall along a cosine between two steps (None while they are open)."""
     warmup = min(1.0, settings.warmup_start + (1 - settings.warmup_start) * (step + 1) / settings.warmup_steps)
     if fall is None:
         return peak * warmup
     part = min(max((step - fall[0]) / max(fall[1] - fall[0], 1), 0.0), 1.0)
-    return (
-        peak * warmup * (settings.final_fraction + (1 - settings.final_fraction) * (1 + math.cos(math.pi * part)) / 2)
-    )
+    cosine = (1 + math.cos(math.pi * part)) / 2
+    return peak * warmup * (settings.final_fraction + (1 - settings.final_fraction) * cosine)
 
 
 class WeightAverage(Generic[_Network]):

@@ -82,13 +82,8 @@ def plan_stages(stages: Sequence[Stage], frames: int, options: PlanOptions) -> t
     The learning rate grows with the square root of the batch, as suits Adam (Malladi et al., *On the SDEs and Scaling
     Rules for Adaptive Gradient Algorithms*, 2022): a stage names a rate and the whole batch that it is for.
 
-    Args:
-        stages: in their order.
-        frames: of the training data.
-        options: of the user.
-
-    Raises:
-        UserError: the batch cannot be shared out, or a budget of minutes is given for a network that trains for days.
+    ``frames`` are those of the training data. Raises UserError where a batch cannot be shared out, or a budget of
+    minutes is given for a network that trains for days.
     """
     if options.minutes is not None and any(stage.data == "clips" for stage in stages):
         raise UserError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,12 +12,10 @@ from rich.table import Table
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.fill_cache import expected_bytes
-from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.scenes import Report
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.draws import TrainingScenes
-from predmapnet.training.data.prepare import DataOptions, count_frames, prepare_data
+from predmapnet.training.data.prepare import DataOptions, PreparedData, count_frames, prepare_data
 from predmapnet.training.dry_run import plan_table
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings, Trainer
@@ -33,8 +30,6 @@ from predmapnet.weights.fit import check_fit, load_weights, start_from
 from predmapnet.weights.inspection import parts_of
 
 WEIGHTS = "weights.safetensors"
-Data = tuple[TrainingScenes, list[CachedScene]]
-"""Scenes that are trained on, and those that are validated on."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +72,8 @@ def train_network(options: RunOptions, report: Report = print) -> Path | None:
     Raises:
         UserError: data, checkpoint, weights or devices do not fit.
     """
-    _check_folder(options, choose_stages(options.config, options.stage))
-    _check_beginning(options)
+    _check_folder(options)
+    _check_weights(options)
     devices, data = options.plan.devices, None
     if not by_torchrun():
         check_devices(options.device, devices)
@@ -97,10 +92,10 @@ def dry_run(options: RunOptions) -> Table:
     return table
 
 
-def run_stages(fabric: Fabric, options: RunOptions, data: Data | None, report: Report) -> bool:
+def run_stages(fabric: Fabric, options: RunOptions, data: PreparedData | None, report: Report) -> bool:
     """Run all stages in one process; return whether they were finished."""
     torch.set_num_threads(options.threads)
-    report = report if fabric.is_global_zero else _say_nothing
+    report = report if fabric.is_global_zero else (lambda _line: None)
     if data is None:
         with fabric.rank_zero_first(local=True):
             data = prepare_data(options.data, options.config, options.threads, report)
@@ -160,29 +155,24 @@ def export(options: RunOptions) -> Path:
     return path
 
 
-def _say_nothing(_line: str) -> None:
-    """All processes but the first are silent."""
-
-
-def _check_folder(options: RunOptions, stages: Sequence[Stage]) -> None:
+def _check_folder(options: RunOptions) -> None:
     """Refuse to mix runs, and to train tracks on a network that sees nothing."""
     started = run_checkpoint.latest(options.folder) is not None
     if started and not options.resume:
         raise UserError(f"{options.folder} holds a run already. Go on with --resume, or choose another --out.")
-    first = stages[0].name == choose_stages(options.config)[0].name
-    if not (first or options.resume or options.initial):
-        raise UserError(f"Stage {stages[0].name} needs a network that sees: give --resume or --init WEIGHTS.")
+    first, usual = (choose_stages(options.config, name)[0].name for name in (options.stage, "all"))
+    if not (first == usual or options.resume or options.initial):
+        raise UserError(f"Stage {first} needs a network that sees: give --resume or --init WEIGHTS.")
 
 
-def _check_beginning(options: RunOptions) -> None:
+def _check_weights(options: RunOptions) -> None:
     """Refuse weights to begin with that are not there or do not fit, before anything is rendered."""
-    if not options.resume and options.initial is None:
+    if options.resume:
+        where = run_checkpoint.to_resume(options.folder)
+        tensors = run_checkpoint.below_prefix("network", run_checkpoint.read_tensors(where, "network"))
+    elif options.initial is not None:
+        where, tensors = options.initial, load_checkpoint(options.initial).network.state_dict()
+    else:
         return
     with torch.device("meta"):
-        network = PredMapNet(options.config)
-    if options.resume:
-        newest = run_checkpoint.to_resume(options.folder)
-        tensors = run_checkpoint.below_prefix("network", run_checkpoint.read_tensors(newest, "network"))
-        check_fit(network, tensors, newest)
-    elif options.initial is not None:
-        check_fit(network, load_checkpoint(options.initial).network.state_dict(), options.initial)
+        check_fit(PredMapNet(options.config), tensors, where)

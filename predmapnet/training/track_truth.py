@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Bool, Float32, Integer
 from predmapnet.training.settings import TrackRules
-
-Integers = NDArray[np.int64]
 
 
 @dataclass
@@ -22,15 +20,15 @@ class TrackTruth:
         element_ids: ``(B, T) int64``; -1 likewise.
     """
 
-    kinds: Integers
-    element_ids: Integers
+    kinds: Integer
+    element_ids: Integer
 
     @classmethod
     def none(cls, batch: int) -> TrackTruth:
         """Return what streams without tracks begin with."""
         return cls(*np.full((2, batch, 0), -1))
 
-    def pieces_of(self, stream: int, kinds: Integers, element_ids: Integers) -> NDArray[np.bool_]:
+    def pieces_of(self, stream: int, kinds: Integer, element_ids: Integer) -> Bool:
         """Return which pieces of truth ``(G)`` each track of a stream stands for, ``(T, G)``."""
         own_kinds, own_ids = self.kinds[stream, :, None], self.element_ids[stream, :, None]
         return (own_kinds == kinds) & (own_ids == element_ids) & (own_ids >= 0)
@@ -38,12 +36,12 @@ class TrackTruth:
     def pieces_in_sight(
         self,
         stream: int,
-        valid: NDArray[np.bool_],
-        kinds: Integers,
-        element_ids: Integers,
-        distance: NDArray[np.float32],
+        valid: Bool,
+        kinds: Integer,
+        element_ids: Integer,
+        distance: Float32,
         exclusive: bool,
-    ) -> tuple[Integers, Integers]:
+    ) -> tuple[Integer, Integer]:
         """Find the piece that each track of a stream answers for.
 
         An element may be cut into several pieces by the ROI; a track answers for the one that is nearest to it.
@@ -81,20 +79,20 @@ class Chosen:
         truth: ``(B, T') int64``, truth that a row answers for in this frame, or -1.
     """
 
-    rows: Integers
-    identity: Integers
-    valid: NDArray[np.bool_]
+    rows: Integer
+    identity: Integer
+    valid: Bool
     owners: TrackTruth
-    truth: Integers
+    truth: Integer
 
 
 def choose_tracks(
-    scores: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    truth: Integers,
+    scores: Float32,
+    valid: Bool,
+    truth: Integer,
     owners: TrackTruth,
-    kinds: Integers,
-    element_ids: Integers,
+    kinds: Integer,
+    element_ids: Integer,
     rules: TrackRules,
     draws: Sequence[np.random.Generator],
 ) -> Chosen:
@@ -120,7 +118,7 @@ def choose_tracks(
     stream = np.arange(len(streams))[:, None]
     answers = np.where(alive, truth[stream, rows], -1)
 
-    def named(of_tracks: Integers, of_truth: Integers) -> Integers:
+    def named(of_tracks: Integer, of_truth: Integer) -> Integer:
         # One more column and entry stand for "none", so that -1 can be looked up.
         old = np.pad(of_tracks, ((0, 0), (0, 1)), constant_values=-1)[stream, identity]
         return np.where(identity >= 0, old, np.append(of_truth, -1)[answers])
@@ -130,9 +128,9 @@ def choose_tracks(
 
 
 def _choose_of_stream(
-    scores: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    truth: Integers,
+    scores: Float32,
+    valid: Bool,
+    truth: Integer,
     draws: np.random.Generator,
     tracks: int,
     rules: TrackRules,

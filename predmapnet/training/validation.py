@@ -8,13 +8,14 @@ import torch
 import torch.distributed as distributed
 
 from mapfusion.elements import FrameMap
+from predmapnet.engines import TorchEngine
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision, thresholds_for
 from predmapnet.evaluation.consistency_ap import consistency_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.frame_cache.scene_cache import CachedScene
+from predmapnet.machine import Precision
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.track_selection import select
 from predmapnet.training.data.batches import collate_frames
 
 EVERY = 4
@@ -28,7 +29,7 @@ def validate(network: PredMapNet, scenes: Sequence[CachedScene], streaming: bool
     """Measure a network on cached scenes; each process maps some of them, and all get the figures.
 
     Args:
-        network: in evaluation mode.
+        network: on any device.
         scenes: whole scenes, the same in all processes.
         streaming: run each scene from its start with state; otherwise every frame stands alone. The frames that
             are measured are the same.
@@ -74,23 +75,15 @@ def map_frames(network: PredMapNet, scene: CachedScene, indices: Iterable[int], 
     """Yield the maps of some frames of a cached scene.
 
     Args:
-        network: in evaluation mode.
+        network: in any mode; it is copied for inference.
         scene: whose images are at the network's size; it knows no times, so frames count as half a second apart.
         indices: the frames, in order.
         streaming: hand the state on from frame to frame.
     """
-    config = network.config
-    empty = network.initial_state(1)
-    state = empty
-    known, geometry = b"", None
+    engine, state = TorchEngine(network, network.device, Precision.FLOAT32, compiled=False), None
     for index in indices:
         frame = scene.frame(index)
-        inputs = collate_frames([frame], config).inputs(network)
-        if (cameras := frame.calibration.fingerprint()) != known:
-            known, geometry = cameras, network.view_geometry(inputs.calibration)
-        outputs = network(inputs, state, geometry)
-        selection = select(outputs, state, config)
-        after = network.advance(state, outputs, selection.instances, inputs, selection.lost)
-        pose = inputs.ego_to_global[0].cpu().numpy()
-        yield to_frame_map(selection, after, outputs.segmentation, config, index * FRAME_INTERVAL_NS, pose)
-        state = after if streaming else empty
+        selection, after, segmentation = engine.step(collate_frames([frame], network.config).inputs(network), state)
+        time = index * FRAME_INTERVAL_NS
+        yield to_frame_map(selection, after, segmentation, network.config, time, frame.ego_to_global)
+        state = after if streaming else None

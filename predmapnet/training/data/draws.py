@@ -112,8 +112,7 @@ class Clips(Dataset[list[CachedFrame]]):
         """Choose what to draw.
 
         Args:
-            scenes: to draw from.
-            augmentation: of the frames.
+            scenes, augmentation: of the frames.
             seed: of the run and of the stage.
             frames: of a clip.
             span: the others are drawn from so many frames before the last one; before the first frame of a scene, the
@@ -155,14 +154,10 @@ class Clips(Dataset[list[CachedFrame]]):
 def step_loader(
     clips: Clips, batch: int, first: int = 0, rank: int = 0, size: int = 1, workers: int = 0
 ) -> DataLoader[Any]:
-    """Return what yields the frames of one optimiser step after the other, as :class:`StreamSegment`.
+    """Return what yields one optimiser step after the other as :class:`StreamSegment`, from step ``first`` on.
 
-    Args:
-        clips: to draw from.
-        batch: clips of a step over all processes; ``size`` divides it.
-        first: step with which to begin.
-        rank, size: which process of how many.
-        workers: processes that load; 0 for none.
+    A step has ``batch`` clips over all processes, of which this is number ``rank`` of ``size``. So many ``workers``
+    load; 0 for none.
     """
     own = batch // size
     starts = (step * batch + rank * own for step in count(first))

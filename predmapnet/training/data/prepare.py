@@ -9,18 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from predmapnet.config import BevFormerConfig, LookupBevConfig, PredMapNetConfig
+from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.datasets.splits import split_names
 from predmapnet.demo_world.catalogue import WORLD_VERSION, scene_infos
 from predmapnet.demo_world.source import DEMO
 from predmapnet.demo_world.training_drive import training_rig
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.fill_cache import fill_from_source, fill_with_demo
-from predmapnet.frame_cache.scene_cache import INDEX, CachedScene
+from predmapnet.frame_cache.scene_cache import INDEX, CachedScene, cache_folder
 from predmapnet.scenes import Report, SceneInfo
 from predmapnet.sources import DATASETS, open_source
 from predmapnet.training.data.draws import TrainingScenes
 
+PreparedData = tuple[TrainingScenes, list[CachedScene]]
+"""Scenes that are trained on, and those that are validated on."""
 TRAINABLE = tuple(name for name in DATASETS if name != "demo-v1")
 
 
@@ -94,17 +96,8 @@ def parse_data_sets(names: Sequence[str], roots: Sequence[Path] = ()) -> tuple[D
 
 def prepare_data(
     options: DataOptions, config: PredMapNetConfig, processes: int, report: Report = print
-) -> tuple[TrainingScenes, list[CachedScene]]:
-    """Bring all scenes of a run into the cache.
-
-    Args:
-        options: what the user chose.
-        config: of the network that is going to be trained.
-        processes: how many work side by side.
-        report: gets lines for the user.
-
-    Returns:
-        The scenes to train on, and those to validate on.
+) -> PreparedData:
+    """Bring all scenes of a run into the cache, so many ``processes`` side by side.
 
     Raises:
         UserError: a data set is missing or broken, or there is nothing to train on.
@@ -181,17 +174,3 @@ def _names(infos: Sequence[SceneInfo], validation: int) -> tuple[list[str], list
     if not by_split["train"] and not measured:
         return by_split["test"], []
     return by_split["train"], [measured[index] for index in spread]
-
-
-def cache_folder(cache: Path, dataset: str, config: PredMapNetConfig) -> Path:
-    """Name the cache of a data set by all that images, codes of cameras, truth and depth depend on.
-
-    Args:
-        cache: folder of all training caches.
-        dataset: its name, with what tells it from others of that name.
-        config: of the network.
-    """
-    depth = f" {config.depth} {config.bev.kind}" if config.depth.enabled else ""
-    codes = f" {config.bev.cameras}" if isinstance(config.bev, BevFormerConfig) else ""
-    key = f"{config.image} {config.bev.kind} {config.roi_length} {config.roi_width}{depth}{codes}"
-    return cache / f"{dataset}-{config.image.width}x{config.image.height}-{sha256(key.encode()).hexdigest()[:8]}"

@@ -78,15 +78,9 @@ class Streams(Dataset[StreamSegment]):
         rank: int = 0,
         size: int = 1,
     ) -> None:
-        """Choose what to draw.
+        """Choose scenes, their features, and which process of how many this is; each has streams of its own.
 
-        Args:
-            scenes: to drive through.
-            store: their features.
-            settings: how many streams a process has, and how long they are.
-            augmentation: of the poses.
-            seed: of the run and of the stage.
-            rank, size: which process of how many; each has streams of its own.
+        ``settings`` says how many streams a process has. Of the augmentation only that of the poses counts.
         """
         self._scenes, self._store, self._settings, self._augmentation = scenes, store, settings, augmentation
         self._seed = seed

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mapfusion.arrays import Byte, Float
 from mapfusion.elements import ElementKind, RegionOfInterest
 from mapfusion.geometry import resample
 from predmapnet.scenes import FrameTruth
-
-Float = NDArray[np.float64]
 
 LINE_THICKNESS = 2
 """As OpenCV counts: with fractional coordinates it draws lines 3 cells (0.9 m) wide, as in MapTracker's target."""
@@ -60,25 +58,18 @@ def equivalent_orders(count: int) -> tuple[Tensor, Tensor]:
         Index tables: ``(2, count)`` for open lines (both directions) and ``(2 * (count - 1), count)`` for closed
         rings whose last point repeats the first (every start, both directions).
     """
-    forward = torch.arange(count)
-    line = torch.stack([forward, forward.flip(0)])
-    corners = count - 1
+    forward, corners = torch.arange(count), count - 1
     start = torch.arange(corners)[:, None]
-    step = torch.arange(count)[None, :]
-    ring = torch.cat([(start + step) % corners, (start - step) % corners])
-    return line, ring
+    ring = torch.cat([(start + forward) % corners, (start - forward) % corners])
+    return torch.stack([forward, forward.flip(0)]), ring
 
 
 def truth_targets(
     truths: Sequence[FrameTruth], roi: RegionOfInterest, points: int, grid: tuple[int, int] | None
 ) -> Targets:
-    """Turn the truth of a batch of frames into targets.
+    """Turn the truth of a batch of frames into targets of ``points`` points per polyline.
 
-    Args:
-        truths: one per frame.
-        roi: the region that the grid and the normalised coordinates cover.
-        points: ``P``, points per polyline.
-        grid: rows and columns of the rasters; None draws nothing (masks of zero size).
+    ``grid`` is rows and columns of the rasters, which cover the region; None draws nothing (masks of zero size).
     """
     frame = [index for index, truth in enumerate(truths) for _ in truth.kinds]
     lines = [line for truth in truths for line in truth.polylines]
@@ -103,14 +94,10 @@ def truth_targets(
     )
 
 
-def draw_element(mask: NDArray[np.uint8], points: Float, kind: ElementKind, roi: RegionOfInterest) -> None:
-    """Draw one element into a BEV raster: lines with a thickness, crossings filled.
+def draw_element(mask: Byte, points: Float, kind: ElementKind, roi: RegionOfInterest) -> None:
+    """Draw one element ``(n, 2)``, metres, ego frame: lines with a thickness, crossings filled.
 
-    Args:
-        mask: ``(rows, columns) uint8``, written in place with 1; row 0 is the largest y, column 0 the smallest x.
-        points: ``(n, 2)``, metres, ego frame.
-        kind: decides between line and filled ring.
-        roi: the region that the raster covers.
+    The ``mask (rows, columns)`` is set to 1 in place; row 0 is the largest y, column 0 the smallest x of the region.
     """
     rows, columns = mask.shape
     column = (points[:, 0] / roi.length + 0.5) * columns - 0.5

@@ -7,11 +7,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from mapfusion.elements import ElementKind
 from predmapnet.network.state import FrameOutputs
 from predmapnet.training.losses.matching import Matched, Truth, best_order
-from predmapnet.training.losses.terms import direction_loss, focal_loss, forecast_losses, mask_loss, point_loss
+from predmapnet.training.losses.terms import direction_loss, focal_loss, forecast_losses, mask_loss
 from predmapnet.training.losses.weights import LossWeights
 from predmapnet.training.track_truth import TrackTruth
 
@@ -41,11 +42,10 @@ class LossSums:
         Together these count one thing at least, so that what nobody found is divided by something.
         """
         sums = torch.stack([total for _, total, _ in self._entries])
-        counts = shared(torch.tensor([count for _, _, count in self._entries], device=sums.device)).clamp(
-            min=1 / processes
-        )
+        counts = shared(torch.tensor([count for _, _, count in self._entries], device=sums.device))
+        shares = (scale * sums / counts.clamp(min=1 / processes)).unbind()
         terms: dict[str, Tensor] = {}
-        for (name, _, _), term in zip(self._entries, (scale * sums / counts).unbind(), strict=True):
+        for (name, _, _), term in zip(self._entries, shares, strict=True):
             terms[name] = terms[name] + term if name in terms else term
         return terms
 
@@ -61,12 +61,7 @@ def add_layers(
 ) -> None:
     """Add the losses of classes, lines and masks of all layers (L_track and L_seg).
 
-    Args:
-        sums: is added to.
-        outputs, truth, matched: of the instant.
-        tracks: number of track rows.
-        weights: of the losses.
-        unit: ``(2,)``, as for :class:`~predmapnet.training.losses.matching.Truth`.
+    ``tracks`` is the number of track rows; ``unit`` as for :class:`~predmapnet.training.losses.matching.Truth`.
     """
     for layer, pairs in zip(outputs.layers, matched.layers, strict=True):
         kinds = truth.targets.kinds[pairs.truth]
@@ -79,7 +74,8 @@ def add_layers(
             points = layer.points[pairs.frame, pairs.row] * unit
             rings = kinds == ElementKind.PED_CROSSING
             target = best_order(points, truth.points[pairs.truth], rings, weights.cost_beta)
-            sums.add("points", weights.points * point_loss(points, target, weights.beta), len(pairs))
+            apart = functional.smooth_l1_loss(points, target, reduction="sum", beta=weights.beta)
+            sums.add("points", weights.points * apart / points.shape[1:].numel(), len(pairs))
             if weights.direction:
                 sums.add("direction", weights.direction * direction_loss(points, target), len(pairs))
         if layer.masks is not None:
@@ -100,8 +96,7 @@ def add_forecasts(
 
     Args:
         sums: is added to.
-        forecasts: ``(B, T, P, 2)``, normalised.
-        owners: of the tracks.
+        forecasts, owners: ``(B, T, P, 2)``, normalised, and whom they are of.
         coming: truth of the next frame.
         size: ``(2,)``, length and width of the region, metres.
         weights: of the losses.

@@ -10,16 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional
 
+from mapfusion.arrays import Bool, Float32, Integer
 from mapfusion.elements import ElementKind
 from predmapnet.network.state import FrameOutputs, LayerPredictions
 from predmapnet.training.data.targets import Targets, equivalent_orders
 from predmapnet.training.losses.weights import LossWeights
-from predmapnet.training.track_truth import Integers, TrackTruth
+from predmapnet.training.track_truth import TrackTruth
 
 FOCAL_ALPHA, FOCAL_GAMMA = 0.25, 2.0
 WORST = 1e9
@@ -69,7 +69,9 @@ class Truth:
     def masks_like(self, like: Tensor) -> Tensor:
         """Return the drawn masks ``(M, H, W)`` at the size of a layer's; a cell is set if any of its cells was."""
         if self._masks is None or self._masks.shape[-2:] != like.shape[-2:]:
-            self._masks = masks_of_size(self.targets.masks, like)
+            drawn = self.targets.masks
+            pooled = functional.adaptive_max_pool2d(drawn[None], like.shape[-2:])[0] if len(drawn) else drawn
+            self._masks = pooled.reshape(len(drawn), *like.shape[-2:])
         return self._masks
 
     def orders(self) -> tuple[Tensor, Tensor, int]:
@@ -109,17 +111,12 @@ def line_costs(lines: Tensor, orders: Tensor, owner: Tensor, pieces: int, beta: 
         ``(B, R, G)``.
     """
     if beta:
-        distance = smooth_l1(lines[:, :, None] - orders[:, None], beta).mean(dim=-1)
+        found, wanted = torch.broadcast_tensors(lines[:, :, None], orders[:, None])
+        distance = functional.smooth_l1_loss(found, wanted, reduction="none", beta=beta).mean(dim=-1)
     else:
         distance = torch.cdist(lines, orders, p=1) / lines.shape[-1]
     best = distance.new_full((*lines.shape[:2], pieces + 1), torch.inf)
     return best.scatter_reduce(2, owner[:, None].expand_as(distance), distance, "amin")[..., :pieces]
-
-
-def smooth_l1(difference: Tensor, beta: float) -> Tensor:
-    """Return half the square over ``beta`` below it, and beyond it the distance less half of ``beta``."""
-    size = difference.abs()
-    return torch.where(size < beta, size**2 / (2 * beta), size - beta / 2)
 
 
 def best_order(points: Tensor, targets: Tensor, rings: Tensor, beta: float = 0.0) -> Tensor:
@@ -135,8 +132,8 @@ def best_order(points: Tensor, targets: Tensor, rings: Tensor, beta: float = 0.0
     table = torch.where(rings[:, None, None], ring, line.repeat(len(ring) // 2, 1))
     which = torch.arange(len(targets), device=targets.device)
     orders = targets[which[:, None, None], table]
-    difference = points.detach()[:, None] - orders
-    distance = smooth_l1(difference, beta) if beta else difference.abs()
+    found = points.detach()[:, None].expand_as(orders)
+    distance = functional.smooth_l1_loss(found, orders, reduction="none", beta=beta)
     return orders[which, distance.sum((2, 3)).argmin(1)]
 
 
@@ -165,13 +162,6 @@ def mask_cost(logits: Tensor, masks: Tensor) -> Tensor:
     return 1 - overlap / (probability.sum(2)[..., None] + drawn.sum(1)[:, None] + 1) + entropy
 
 
-def masks_of_size(masks: Tensor, like: Tensor) -> Tensor:
-    """Bring drawn masks ``(M, H, W)`` to a coarser grid; a cell is set if any of its cells was."""
-    if masks.shape[-2:] == like.shape[-2:] or not len(masks):
-        return masks.reshape(len(masks), *like.shape[-2:])
-    return functional.adaptive_max_pool2d(masks[None], like.shape[-2:])[0]
-
-
 @dataclass
 class Matched:
     """Assignment of queries to the truth in one instant.
@@ -184,9 +174,9 @@ class Matched:
     """
 
     layers: list[Assignment]
-    truth: Integers
-    scores: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    truth: Integer
+    scores: Float32
+    valid: Bool
 
 
 @torch.no_grad()
@@ -201,7 +191,7 @@ def match(
     Args:
         outputs: rows are tracks, then detections.
         truth: of the instant.
-        owners: what the tracks stand for.
+        owners: of the tracks.
         weights: of the costs.
         exclusive: detections do not see the truth that tracks answer for (``suppress``), and no two tracks answer for
             one piece.
@@ -216,7 +206,7 @@ def match(
     costs = [_layer_costs(layer, truth, orders, weights, unit) for layer in deciding]
     on_host = _to_host([*costs, distance, scores, outputs.query_valid])
     apart, score, valid = on_host[-3], on_host[-2], on_host[-1] > 0
-    pairs: list[list[Integers]] = [[] for _ in deciding]
+    pairs: list[list[Integer]] = [[] for _ in deciding]
     for stream, (start, end) in enumerate(zip(truth.begin[:-1], truth.begin[1:], strict=True)):
         pieces = slice(start, end)
         offered = np.arange(end - start)
@@ -233,21 +223,15 @@ def match(
     joined = [np.concatenate(found, axis=1) for found in pairs]
     answers = np.full(valid.shape, -1)
     answers[joined[-1][0], joined[-1][1]] = joined[-1][2]
-    on_device = (
-        torch.from_numpy(np.concatenate(joined, axis=1)).to(scores.device).split([j.shape[1] for j in joined], 1)
-    )
-    by_layer = {id(layer): Assignment(*three) for layer, three in zip(deciding, on_device, strict=True)}
+    together = torch.from_numpy(np.concatenate(joined, axis=1)).to(scores.device)
+    parts = together.split([each.shape[1] for each in joined], 1)
+    by_layer = {id(layer): Assignment(*three) for layer, three in zip(deciding, parts, strict=True)}
     layers = [by_layer.get(id(layer), by_layer[id(last)]) for layer in outputs.layers]
     return Matched(layers, answers, score, valid)
 
 
-def assign(cost: NDArray[np.float32], rows: Integers, pieces: Integers) -> tuple[Integers, Integers]:
-    """Return the cheapest pairs of some rows and some pieces; as many as the fewer of both.
-
-    Args:
-        cost: ``(R, G)``.
-        rows, pieces: those that take part.
-    """
+def assign(cost: Float32, rows: Integer, pieces: Integer) -> tuple[Integer, Integer]:
+    """Return the cheapest pairs of some rows and some pieces of a cost ``(R, G)``; as many as the fewer of both."""
     part = np.nan_to_num(cost[np.ix_(rows, pieces)], nan=WORST, posinf=WORST, neginf=-WORST)
     chosen, answered = linear_sum_assignment(part)
     return rows[chosen], pieces[answered]
@@ -268,7 +252,7 @@ def _layer_costs(
     return cost
 
 
-def _to_host(tensors: Sequence[Tensor]) -> list[NDArray[np.float32]]:
+def _to_host(tensors: Sequence[Tensor]) -> list[Float32]:
     """Bring tensors to the host in one go."""
     flat = torch.cat([tensor.flatten().float() for tensor in tensors]).cpu().numpy()
     parts = np.split(flat, np.cumsum([tensor.numel() for tensor in tensors])[:-1])

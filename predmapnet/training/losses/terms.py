@@ -12,7 +12,7 @@ from mapfusion.elements import RegionOfInterest
 from predmapnet.network.ego_motion import invert_pose, move_points, plane_motion
 from predmapnet.network.maptracker.motion_mlp import MotionMlp, pose_vector
 from predmapnet.training.data.targets import Targets
-from predmapnet.training.losses.matching import FOCAL_ALPHA, FOCAL_GAMMA, best_order, smooth_l1
+from predmapnet.training.losses.matching import FOCAL_ALPHA, FOCAL_GAMMA, best_order
 from predmapnet.training.losses.weights import LossWeights
 
 SEGMENTATION_POSITIVE_WEIGHT = 3.0
@@ -33,11 +33,6 @@ def focal_loss(logits: Tensor, target: Tensor) -> Tensor:
     wrong = probability * (1 - target) + (1 - probability) * target
     alpha = FOCAL_ALPHA * target + (1 - FOCAL_ALPHA) * (1 - target)
     return alpha * wrong**FOCAL_GAMMA * entropy
-
-
-def point_loss(points: Tensor, target: Tensor, beta: float) -> Tensor:
-    """Smooth L1, mean over the coordinates of polylines ``(n, P, 2)``, summed over polylines."""
-    return smooth_l1(points - target, beta).mean((1, 2)).sum()
 
 
 def direction_loss(points: Tensor, target: Tensor) -> Tensor:
@@ -142,6 +137,7 @@ def transformation_losses(
     wanted = functional.one_hot(labels, there[0].shape[-1] + 1)[:, :-1].to(tracks.dtype)
     lines, classes = tracks.new_zeros(()), tracks.new_zeros(())
     for (logits, found), truth in ((there, moved), (back, points)):
-        lines = lines + (smooth_l1(found - truth, weights.beta) * inside).sum() / points.shape[1:].numel()
+        apart = functional.smooth_l1_loss(found, truth, reduction="none", beta=weights.beta)
+        lines = lines + (apart * inside).sum() / points.shape[1:].numel()
         classes = classes + focal_loss(logits, wanted).sum()
     return weights.transformation * weights.points * lines, weights.transformation * weights.focal * classes
