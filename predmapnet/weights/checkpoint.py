@@ -9,14 +9,17 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch.overrides import TorchFunctionMode
 
 from predmapnet import __version__
+from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.files import write_file
 from predmapnet.network.predmapnet import PredMapNet
@@ -25,6 +28,8 @@ from predmapnet.weights.files import KEY, description, existing_weights, unreada
 from predmapnet.weights.fit import is_finite
 
 FORMAT = 1
+MARGIN = 1 << 24
+"""Numbers that are allocated beside the weights, at most."""
 _SHOWN_NAMES = 4
 
 
@@ -93,10 +98,7 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     facts = about.get("facts")
     if not isinstance(facts, dict):
         raise UserError(f"{path}: its description has no object 'facts', but {str(facts)[:40]}.")
-    with torch.device("meta"):  # what does not fit the weights may be of any size
-        skeleton = PredMapNet(config)
-    _check_fit(tensors, skeleton, path)
-    network = PredMapNet(config)
+    network = _fitting_network(config, tensors, path)
     network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
     network.eval()
     return Checkpoint(network, facts, str(about.get("version")), weights_hash(path))
@@ -104,6 +106,44 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
 
 def _full(tensor: torch.Tensor) -> torch.Tensor:
     return tensor.float() if tensor.is_floating_point() else tensor
+
+
+class _TooLargeError(Exception):
+    """More numbers are asked for than a network that fits its weights can have."""
+
+
+class _Bounded(TorchFunctionMode):
+    """Lets no more than some number of numbers be allocated."""
+
+    def __init__(self, numbers: int) -> None:
+        super().__init__()
+        self._left = numbers
+
+    def __torch_function__(
+        self, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if function in (torch.empty, torch.randn, torch.zeros, torch.ones):
+            sizes = args[0] if args and not isinstance(args[0], int) else args
+            self._left -= prod(sizes)
+            if self._left < 0:
+                raise _TooLargeError
+        return function(*args, **(kwargs or {}))
+
+
+def _fitting_network(config: PredMapNetConfig, tensors: Mapping[str, torch.Tensor], path: Path) -> PredMapNet:
+    """Build the network of a configuration if the weights fit it; raises UserError if not.
+
+    What does not fit may be of any size. Then a network without memory tells what is wrong; the first of these costs
+    two seconds, so those that fit go without.
+    """
+    try:
+        with _Bounded(2 * sum(tensor.numel() for tensor in tensors.values()) + MARGIN):
+            network = PredMapNet(config)
+    except _TooLargeError:
+        with torch.device("meta"):
+            network = PredMapNet(config)
+    _check_fit(tensors, network, path)
+    return network
 
 
 def _check_fit(tensors: Mapping[str, torch.Tensor], network: PredMapNet, path: Path) -> None:
