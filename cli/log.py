@@ -93,6 +93,37 @@ def from_py123d(
     _say(made, as_json)
 
 
+@log.command("from-kitti", cls=PlainCommand)
+def from_kitti(
+    drive: Annotated[Path, typer.Argument(help="Folder <date>/<date>_drive_NNNN_sync.", metavar="DRIVE")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log to make.")],
+    as_json: Json = False,
+) -> None:
+    """Make a log of your own from a drive of KITTI raw.
+
+    Of the four cameras, which see the same, it has the left colour camera. The calibration of the day must lie in the
+    folder around the drive.
+    """
+    from predmapnet.datasets.kitti_and_pandaset import log_from_kitti
+
+    _say(log_from_kitti(drive, out), as_json)
+
+
+@log.command("from-pandaset", cls=PlainCommand)
+def from_pandaset(
+    scene: Annotated[Path, typer.Argument(help="Folder of a scene, with camera and lidar.", metavar="SCENE")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the log to make.")],
+    height: Annotated[
+        float | None, typer.Option(help="Metres of the poses above the road. Default: 0.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a log of your own from a scene of PandaSet."""
+    from predmapnet.datasets.kitti_and_pandaset import log_from_pandaset
+
+    _say(log_from_pandaset(scene, out, height), as_json)
+
+
 def _say(made: MadeLog, as_json: bool) -> None:
     """Print what was made of a recording."""
     from cli.console import counted, print_json, say_notes

@@ -1,0 +1,229 @@
+"""Drives in the layouts of KITTI raw and PandaSet become the log that they were made from; what is wrong is told."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from predmapnet.datasets.kitti_and_pandaset import log_from_kitti, log_from_pandaset
+from predmapnet.datasets.own_logs.scene import LogScene
+from predmapnet.errors import UserError
+from tests.predmapnet.datasets.own_logs.drawn_log import bend, entry, write_log
+
+CAMERAS = {"front_camera": entry(0, 160, 96, 90.0), "left_camera": entry(80, 160, 96, 90.0, 5.0)}
+FRAMES = 6
+LATITUDE, LONGITUDE = 49.0112, 8.4229
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A log whose cameras take their images at the poses' times, and 30 ms after them."""
+    folder = write_log(
+        tmp_path_factory.mktemp("logs") / "drive", CAMERAS, bend(FRAMES + 1), 30_000_000, rows=range(FRAMES)
+    )
+    return LogScene(folder, 1000.0)
+
+
+def line(name: str, values) -> str:
+    return f"{name}: " + " ".join(f"{value:.12e}" for value in np.ravel(values))
+
+
+def clock(nanoseconds: int) -> str:
+    seconds, rest = divmod(int(nanoseconds), 10**9)
+    return str(np.datetime64(seconds, "s")).replace("T", " ") + f".{rest:09d}"
+
+
+def geodetic(east: float, north: float) -> tuple[float, float]:
+    """Latitude and longitude, by the equations of an east-north-up frame at LATITUDE, LONGITUDE (WGS84)."""
+    a, e2 = 6378137.0, 6.69437999014e-3
+    p, t = np.radians([LATITUDE, LONGITUDE])
+    n = a / np.sqrt(1 - e2 * np.sin(p) ** 2)
+    origin = np.array([n * np.cos(p) * np.cos(t), n * np.cos(p) * np.sin(t), n * (1 - e2) * np.sin(p)])
+    axes = np.array([[-np.sin(t), np.cos(t), 0], [-np.sin(p) * np.cos(t), -np.sin(p) * np.sin(t), np.cos(p)]])
+    x, y, z = origin + east * axes[0] + north * axes[1]
+    latitude = np.arctan2(z, np.hypot(x, y) * (1 - e2))
+    for _ in range(5):
+        radius = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+        latitude = np.arctan2(z + e2 * radius * np.sin(latitude), np.hypot(x, y))
+    return float(np.degrees(latitude)), float(np.degrees(np.arctan2(y, x)))
+
+
+def write_kitti(log: LogScene, day, camera: str = "02"):
+    """The front camera as KITTI raw: its mounting split over the four calibration files."""
+    drive = day / "2011_09_26_drive_0001_sync"
+    front = log.rig[0]
+    lidar, first = np.eye(4), np.eye(4)  # of the ego frame
+    lidar[:3, :3], lidar[:3, 3] = Rotation.from_euler("xyz", [0.01, -0.02, 0.03]).as_matrix(), [0.8, -0.3, 0.7]
+    rectified = front.camera_to_ego[:3, :3]
+    turn = Rotation.from_euler("xyz", [0.01, 0.005, -0.007]).as_matrix()  # of rectification
+    baseline = np.array([-0.06, 0.0003, 0.002])  # of this camera in the first one's rectified frame
+    first[:3, :3], first[:3, 3] = rectified @ turn, front.camera_to_ego[:3, 3] - rectified @ baseline
+    k = front.intrinsics - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    to_lidar, to_first = np.linalg.inv(lidar), np.linalg.inv(first) @ lidar
+    day.mkdir()
+    for name, pose in (("imu_to_velo", to_lidar), ("velo_to_cam", to_first)):
+        text = ["calib_time: 25-May-2012 16:47:16", line("R", pose[:3, :3]), line("T", pose[:3, 3])]
+        (day / f"calib_{name}.txt").write_text("\n".join(text) + "\n")
+    text = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02", line("R_rect_00", turn),
+            line("R_rect_02", np.eye(3)), line(f"P_rect_{camera}", np.c_[k, k @ -baseline])]  # fmt: skip
+    (day / "calib_cam_to_cam.txt").write_text("\n".join(text) + "\n")
+    times, paths = log.images["front_camera"]
+    images, oxts = drive / f"image_{camera}", drive / "oxts"
+    for folder, stamps in ((images, times), (oxts, log.poses.timestamps)):
+        (folder / "data").mkdir(parents=True)
+        (folder / "timestamps.txt").write_text("\n".join(map(clock, stamps)) + "\n")
+    for row, path in enumerate(paths):
+        cv2.imwrite(str(images / "data" / f"{row:010d}.png"), cv2.imread(str(path)))
+    for row, pose in enumerate(log.poses.ego_to_global):
+        yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
+        packet = [*geodetic(*pose[:2, 3]), 116.0 + pose[2, 3], roll, pitch, yaw, *[0.0] * 19, 4, 11, 6, 6, 6]
+        (oxts / "data" / f"{row:010d}.txt").write_text(" ".join(map(repr, map(float, packet))) + "\n")
+    return drive
+
+
+def write_pandaset(log: LogScene, scene):
+    """The log as a scene of PandaSet, whose car has x right and y ahead."""
+    turned = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])  # theirs in our ego frame
+    sensors = {"lidar": (log.poses.timestamps, [pose @ turned for pose in log.poses.ego_to_global])}
+    for camera in log.rig:
+        times, paths = log.images[camera.name]
+        poses = [log.poses.at(int(time)) @ camera.camera_to_ego for time in times]
+        sensors[f"camera/{camera.name}"] = (times, poses)
+        folder = scene / "camera" / camera.name
+        folder.mkdir(parents=True)
+        for row, path in enumerate(paths):
+            shutil.copyfile(path, folder / f"{row:02d}.jpg")
+        k = camera.intrinsics
+        values = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2] - 0.5, "cy": k[1, 2] - 0.5}
+        (folder / "intrinsics.json").write_text(json.dumps(values))
+    (scene / "lidar").mkdir()
+    for name, (times, poses) in sensors.items():
+        listed = []
+        for pose in poses:
+            x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
+            place = dict(zip("xyz", pose[:3, 3].tolist(), strict=True))
+            listed.append({"position": place, "heading": {"w": w, "x": x, "y": y, "z": z}})
+        (scene / name / "poses.json").write_text(json.dumps(listed))
+        (scene / name / "timestamps.json").write_text(json.dumps([int(time) / 1e9 for time in times]))
+    return scene
+
+
+def pixels(scene: LogScene, name: str, row: int, points, shift=(0.0, 0.0, 0.0)):
+    """Where points of the global frame, shifted, are in a camera's image, by the pose of the image's own instant."""
+    camera = next(camera for camera in scene.rig if camera.name == name)
+    pose = scene.poses.at(int(scene.images[name][0][row])) @ camera.camera_to_ego
+    seen = (np.asarray(points) + shift - pose[:3, 3]) @ pose[:3, :3] @ camera.intrinsics.T
+    return seen[:, :2] / seen[:, 2:]
+
+
+def test_a_drive_of_kitti_raw_becomes_the_log_that_it_was_made_from(log, tmp_path):
+    made = log_from_kitti(write_kitti(log, tmp_path / "2011_09_26"), tmp_path / "out")
+    found, (front, _) = LogScene(tmp_path / "out", 1000.0), log.rig
+    (camera,) = found.rig
+    assert (camera.name, camera.width, camera.height, camera.ground_height) == ("image_02", 160, 96, -0.93)
+    np.testing.assert_allclose(camera.intrinsics, front.intrinsics, atol=1e-9)
+    np.testing.assert_allclose(camera.camera_to_ego, front.camera_to_ego, atol=1e-8)
+    assert made.images == {"image_02": FRAMES} and made.notes == []
+    np.testing.assert_array_equal(found.images["image_02"][0], log.images["front_camera"][0])
+    np.testing.assert_array_equal(found.poses.timestamps, log.poses.timestamps)
+    up = np.array([0.0, 0.0, 116.0])
+    np.testing.assert_allclose(found.poses.ego_to_global[:, :3, :3], log.poses.ego_to_global[:, :3, :3], atol=1e-8)
+    np.testing.assert_allclose(found.poses.ego_to_global[:, :3, 3], log.poses.ego_to_global[:, :3, 3] + up, atol=1e-5)
+    assert (found.georeference.latitude, found.georeference.longitude) == pytest.approx(
+        (LATITUDE, LONGITUDE), abs=1e-10
+    )
+    ground = [[12.0, 1.0, 0.0], [20.0, -3.0, 0.0]]
+    for row in (0, FRAMES - 1):
+        image = cv2.imread(str(found.images["image_02"][1][row]))
+        assert np.array_equal(image, cv2.imread(str(log.images["front_camera"][1][row])))
+        wanted = pixels(log, "front_camera", row, ground)
+        np.testing.assert_allclose(pixels(found, "image_02", row, ground, up), wanted, atol=1e-4)
+
+
+def test_a_scene_of_pandaset_becomes_the_log_that_it_was_made_from(log, tmp_path):
+    made = log_from_pandaset(write_pandaset(log, tmp_path / "002"), tmp_path / "out", height=0.3)
+    found = LogScene(tmp_path / "out", 1000.0)
+    assert made.notes == [] and made.images == {"front_camera": FRAMES, "left_camera": FRAMES}
+    np.testing.assert_allclose(found.poses.ego_to_global, log.poses.ego_to_global, atol=1e-6)
+    ground = {"front_camera": [[12.0, 5.0, 0.0], [20.0, -1.0, 0.0]], "left_camera": [[3.0, 9.0, 0.0], [5.0, 15.0, 0.0]]}
+    for a, b in zip(found.rig, log.rig, strict=True):
+        assert (a.name, a.width, a.height, a.ground_height) == (b.name, b.width, b.height, b.ground_height)
+        np.testing.assert_allclose(a.intrinsics, b.intrinsics, atol=1e-9)
+        np.testing.assert_allclose(a.camera_to_ego, b.camera_to_ego, atol=1e-6)
+        # Their times are seconds as floating-point numbers.
+        assert np.abs(found.images[a.name][0] - log.images[a.name][0]).max() < 500
+        for row, (here, there) in enumerate(zip(found.images[a.name][1], log.images[a.name][1], strict=True)):
+            assert here.read_bytes() == there.read_bytes()
+            wanted = pixels(log, a.name, row, ground[a.name])
+            np.testing.assert_allclose(pixels(found, a.name, row, ground[a.name]), wanted, atol=1e-4)
+    assert "taken to lie on the road" in log_from_pandaset(tmp_path / "002", tmp_path / "flat").notes[0]
+
+
+KITTI_FAULTS = {
+    "calib_velo_to_cam.txt": ("T: ", "T: x ", "'T'"),
+    "calib_imu_to_velo.txt": ("R: ", "Q: ", "'R' is missing"),
+    "calib_cam_to_cam.txt": ("P_rect_02", "P_rect_00", "'P_rect_02' is missing"),
+    "2011_09_26_drive_0001_sync/image_02/timestamps.txt": ("2017-07-14 02:40:00.1", "noon", "line 2"),
+    "2011_09_26_drive_0001_sync/oxts/timestamps.txt": ("2017-07-14 02:40:00.600000000", "", "line 7"),
+    "2011_09_26_drive_0001_sync/oxts/data/0000000002.txt": ("49.", "x49.", "6 finite numbers"),
+}
+
+
+@pytest.mark.parametrize("name", KITTI_FAULTS)
+def test_a_fault_of_kitti_raw_is_told_with_its_file(log, tmp_path, name):
+    drive, path = write_kitti(log, tmp_path / "day"), tmp_path / "day" / name
+    old, new, told = KITTI_FAULTS[name]
+    content = path.read_text()
+    assert old in content
+    path.write_text(content.replace(old, new))
+    with pytest.raises(UserError, match=told) as raised:
+        log_from_kitti(drive, tmp_path / "out")
+    assert str(path) in str(raised.value) and not (tmp_path / "out").exists()
+
+
+PANDASET_FAULTS = {
+    "lidar/poses.json": lambda listed: listed[1]["heading"].update(w=3.0),
+    "camera/left_camera/poses.json": lambda listed: listed[2].pop("position"),
+    "camera/left_camera/timestamps.json": lambda listed: listed.reverse(),
+    "camera/front_camera/intrinsics.json": lambda values: values.update(cx="nan"),
+}
+
+
+@pytest.mark.parametrize("name", PANDASET_FAULTS)
+def test_a_fault_of_pandaset_is_told_with_its_file(log, tmp_path, name):
+    scene = write_pandaset(log, tmp_path / "002")
+    path = scene / name
+    content = json.loads(path.read_text())
+    PANDASET_FAULTS[name](content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(UserError) as raised:
+        log_from_pandaset(scene, tmp_path / "out")
+    assert str(path) in str(raised.value) and not (tmp_path / "out").exists()
+    path.write_text("[")
+    with pytest.raises(UserError, match=path.name):
+        log_from_pandaset(scene, tmp_path / "out")
+
+
+def test_poses_of_another_scene_and_missing_images_are_told(log, tmp_path):
+    scene = write_pandaset(log, tmp_path / "002")
+    (scene / "camera" / "left_camera" / "03.jpg").unlink()
+    assert "missing: 1 images of left_camera" in log_from_pandaset(scene, tmp_path / "out").notes
+    path = scene / "lidar" / "poses.json"
+    listed = json.loads(path.read_text())
+    path.write_text(json.dumps([{**pose, "position": listed[0]["position"]} for pose in listed]))
+    with pytest.raises(UserError, match="this camera moves"):
+        log_from_pandaset(scene, tmp_path / "other")
+
+
+def test_what_is_no_such_drive_is_told(log, tmp_path):
+    drive = write_kitti(log, tmp_path / "day", "00")
+    assert log_from_kitti(drive, tmp_path / "grey").images == {"image_00": FRAMES}
+    drive.rename(tmp_path / "day" / "2011_09_26_drive_0001_extract")
+    for read, message in ((log_from_kitti, "image_02"), (log_from_pandaset, "lidar")):
+        with pytest.raises(UserError, match=message):
+            read(tmp_path, tmp_path / "out")
+    with pytest.raises(UserError, match="_sync"):
+        log_from_kitti(tmp_path / "day" / "2011_09_26_drive_0001_extract", tmp_path / "out")
