@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
-from uuid import UUID
 
 import cv2
 import numpy as np
@@ -43,7 +42,8 @@ class _Sheet:
         self.polygons: list[Record] = []
 
     def token(self, layer: str, index: int) -> str:
-        return str(UUID(hex=token(self.name, "expansion", layer, index)))
+        digits = token(self.name, "expansion", layer, index)
+        return f"{digits[:8]}-{digits[8:12]}-{digits[12:16]}-{digits[16:20]}-{digits[20:]}"
 
     def node_tokens(self, points: Float) -> list[str]:
         for x, y in points.tolist():

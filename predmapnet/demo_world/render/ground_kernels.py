@@ -80,24 +80,24 @@ def fill_materials(
             out[row, column, 3] = shade
 
 
-@kernel
-def _edge(x: float, y: float, quads: Float, index: int, first: int, second: int) -> float:
-    """Signed distance to the left of the edge between two corners, texels."""
-    start_x, start_y = quads[index, first, 0], quads[index, first, 1]
-    edge_x, edge_y = quads[index, second, 0] - start_x, quads[index, second, 1] - start_y
-    length = np.sqrt(edge_x * edge_x + edge_y * edge_y) + 1e-12
-    return float(((y - start_y) * edge_x - (x - start_x) * edge_y) / length)
+def edge_lines(quads: Float) -> Float:
+    """Return factors ``(n, 4, 3)`` of x, y and 1: the distance to the left of each edge of ``(n, 4, 2)`` quads."""
+    step = np.roll(quads, -1, axis=1) - quads
+    step /= np.linalg.norm(step, axis=2, keepdims=True) + 1e-12
+    across, along = -step[..., 1], step[..., 0]
+    return np.stack([across, along, -across * quads[..., 0] - along * quads[..., 1]], axis=2)
 
 
 @kernel
-def fill_paint(quads: Float, attributes: Float, texel: float, wear_tile: Float32, paint: Byte) -> None:
+def fill_paint(quads: Float, lines: Float, attributes: Float, wear_tile: Float32, cover: Float, paint: Byte) -> None:
     """Paint quadrilaterals with the exact share of each texel that they cover.
 
     Args:
         quads: ``(n, 4, 2)`` corners, texels, counter-clockwise (x to y).
+        lines: of their edges; see :func:`edge_lines`.
         attributes: ``(n, 3)``: wear, albedo, yellow.
-        texel: metres per texel.
         wear_tile: noise in [0, 1], evenly spread: the share ``wear`` of it chips off.
+        cover: ``(4,)``, overwritten.
         paint: ``(rows, columns, 3)``: coverage, square root of albedo, yellow.
     """
     rows, columns = paint.shape[0], paint.shape[1]
@@ -112,11 +112,10 @@ def fill_paint(quads: Float, attributes: Float, texel: float, wear_tile: Float32
         for row in range(max(0, int(low_y) - margin), min(rows, int(high_y) + margin + 1)):
             for column in range(max(0, int(low_x) - margin), min(columns, int(high_x) + margin + 1)):
                 x, y = column + 0.5, row + 0.5
-                low = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 0, 1)))
-                high = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 2, 3)))
-                start = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 3, 0)))
-                stop = min(1.0, max(0.0, 0.5 + _edge(x, y, quads, index, 1, 2)))
-                coverage = max(0.0, low + high - 1) * max(0.0, start + stop - 1)
+                for edge in range(4):
+                    distance = lines[index, edge, 0] * x + lines[index, edge, 1] * y + lines[index, edge, 2]
+                    cover[edge] = min(1.0, max(0.0, 0.5 + distance))
+                coverage = max(0.0, cover[0] + cover[2] - 1) * max(0.0, cover[1] + cover[3] - 1)
                 if coverage > 0 and wear > 0:
                     chip = 0.65 * wear_tile[row & 1023, column & 1023]
                     chip += 0.35 * wear_tile[(5 * row + 311) & 1023, (5 * column + 97) & 1023]

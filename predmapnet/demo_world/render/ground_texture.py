@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 
 from mapfusion.arrays import Byte, Float
-from predmapnet.demo_world.render.ground_kernels import compose, fill_materials, fill_paint, halve
+from predmapnet.demo_world.render.ground_kernels import compose, edge_lines, fill_materials, fill_paint, halve
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.paint import paint_quads, ribbon
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
@@ -59,19 +59,17 @@ class Pyramid(NamedTuple):
 
     Attributes:
         texels: ``(n, 4) uint8``: square roots of albedo and the light that shadows leave, level after level.
-        starts, rows, columns: ``(levels,) int64``, where each level begins and how large it is.
+        levels: ``(3, levels) int64``, where each level begins, its rows and its columns.
         base, paint: ``(rows, columns, 4)`` and ``(rows, columns, 3) uint8``: the finest level before painting, and
             the paint (coverage, albedo, yellow), with which near edges are drawn sharply.
-        placement: ``(5,) float64``: origin x, y (metres), cosine and sine of the texture's turn, texels per metre.
+        placement: origin x, y (metres), cosine and sine of the texture's turn, texels per metre.
     """
 
     texels: Byte
-    starts: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    levels: NDArray[np.int64]
     base: Byte
     paint: Byte
-    placement: Float
+    placement: tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -268,7 +266,7 @@ def _pyramid(
     corners, attributes = painted
     attributes = attributes * [1.0, 1 - 0.35 * light.wetness, 1.0]
     quads = sheet.to_texels(corners.reshape(-1, 2)).reshape(-1, 4, 2)
-    fill_paint(quads, attributes, sheet.texel, fractal_tile(0.75, seed=9), paint)
+    fill_paint(quads, edge_lines(quads), attributes, fractal_tile(0.75, seed=9), np.empty(4), paint)
 
     sizes = [(sheet.rows >> level, sheet.columns >> level) for level in range(LEVELS + 1)]
     counts = np.array([rows * columns for rows, columns in sizes])
@@ -278,9 +276,9 @@ def _pyramid(
     compose(base, paint, levels[0])
     for fine, coarse in pairwise(levels):
         halve(fine, coarse)
-    rows, columns = (np.array(side, dtype=np.int64) for side in zip(*sizes, strict=True))
-    placement = np.array([*sheet.origin, sheet.turn[0, 0], sheet.turn[0, 1], 1 / sheet.texel])
-    return Pyramid(texels, starts[:-1].astype(np.int64), rows, columns, base, paint, placement)
+    x, y, cosine, sine = map(float, (*sheet.origin, *sheet.turn[0]))
+    table_of_levels = np.column_stack([starts[:-1], sizes]).T.astype(np.int64, order="C")
+    return Pyramid(texels, table_of_levels, base, paint, (x, y, cosine, sine, 1 / sheet.texel))
 
 
 def paint_ground(world: World, light: Light, texel: float = FINE_TEXEL) -> tuple[Pyramid, Pyramid]:

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapfusion.arrays import Byte, Float, Float32, Integer, Integer32
+from mapfusion.arrays import Byte, Float, Float32, Integer
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import kernel, part
 from predmapnet.demo_world.render.mesh import Mesh
-from predmapnet.demo_world.render.raster import Vector, View, ball_depth, face_plane, pixel_ray
+from predmapnet.demo_world.render.raster import Vector, View, ZBuffer, ball_depth, pixel_ray
 from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
 from predmapnet.demo_world.street.looks import Light
 
@@ -23,9 +23,10 @@ class Surroundings(NamedTuple):
         light: light of the scene.
         white, fractal, clouds: noise tiles.
         lamps: ``(rows, columns) float32``, light of street lamps on the ground, one cell per metre.
-        lamps_origin: ``(2,) float64``, metres.
+        lamps_origin: of the lamps' cell (0, 0), metres.
         global_to_ego: ``(4, 4) float64``.
         sunlit: ``(solids,) float32``, share of the sun that reaches the foot of each solid.
+        styles: ``(solids, 6) float64``, of facades.
     """
 
     fine: Pyramid
@@ -35,9 +36,10 @@ class Surroundings(NamedTuple):
     fractal: Float32
     clouds: Float32
     lamps: Float32
-    lamps_origin: Float
+    lamps_origin: tuple[float, float]
     global_to_ego: Float
     sunlit: Float32
+    styles: Float
 
 
 @part
@@ -126,7 +128,9 @@ def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth:
     if material == 1:
         along = (y - mesh.corners[face, 0, 1]) * nx - (x - mesh.corners[face, 0, 0]) * ny if abs(nz) < 0.5 else 0.0
         blur = depth / view.focal_x / max(0.15, -(ray[0] * nx + ray[1] * ny) / length)
-        red, green, blue, glass, lit_window = facade(light, around.fractal, owner, along, z, blur, red, green, blue)
+        red, green, blue, glass, lit_window = facade(
+            light, around.fractal, around.styles, owner, along, z, blur, red, green, blue
+        )
     elif material == 3 or material == 10 or material == 0:
         dirt = 0.85 + 0.3 * smooth_noise(around.fractal, (x - y) * 9, (y + z) * 9)
         red, green, blue = red * dirt, green * dirt, blue * dirt
@@ -198,8 +202,8 @@ def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth
 
 @kernel
 def shade_image(
-    around: Surroundings, mesh: Mesh, view: View, samples: int, most: int, ids: Integer32, nearness: Float32,
-    dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
+    around: Surroundings, mesh: Mesh, view: View, samples: int, most: int, solids: ZBuffer, dynamic: Byte,
+    found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
 ) -> None:  # fmt: skip
     """Shade all pixels; each face in a pixel is shaded once, weighted by the samples that it covers.
 
@@ -207,7 +211,7 @@ def shade_image(
         around, mesh, view: what is seen.
         samples: per pixel and direction.
         most: largest number of ground samples along a footprint.
-        ids, nearness: z-buffer, ``(samples * height, samples * width)``.
+        solids: z-buffer.
         dynamic: ``(height, width)``, 255 where no moving thing darkens the ground.
         found, scratch: ``(16,)`` and ``(4, 16)``, overwritten.
         image: ``(height, width, 3)`` receives linear radiance.
@@ -219,11 +223,20 @@ def shade_image(
     each = 1.0 / (samples * samples)
     for row in range(view.height):
         for column in range(view.width):
-            kinds = 0
+            first = solids.ids[row * samples, column * samples]
+            same, closest = True, 0.0
             for i in range(samples):
                 for j in range(samples):
-                    near = nearness[row * samples + i, column * samples + j]
-                    number = ids[row * samples + i, column * samples + j]
+                    same &= solids.ids[row * samples + i, column * samples + j] == first
+                    closest = max(closest, solids.nearness[row * samples + i, column * samples + j])
+            kinds = 1
+            found[0], weight[0], sum_x[0], sum_y[0], close[0] = first, 1.0, column + 0.5, row + 0.5, closest
+            if not same:
+                kinds = 0
+            for i in range(0 if same else samples):
+                for j in range(samples):
+                    near = solids.nearness[row * samples + i, column * samples + j]
+                    number = solids.ids[row * samples + i, column * samples + j]
                     x, y = column + (j + 0.5) / samples, row + (i + 0.5) / samples
                     slot = 0
                     while slot < kinds and found[slot] != number:
@@ -254,7 +267,7 @@ def shade_image(
                         length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
                         colour = sky(around.light, around.clouds, ray[0] / length, ray[1] / length, ray[2] / length)
                 elif number < faces:
-                    plane = face_plane(mesh.corners, mesh.normals, number, view)
+                    plane = solids.planes[number]
                     shaded = 1 / max(plane[0] * x + plane[1] * y + plane[2], 1e-6)
                     colour = _face_colour(around, mesh, view, number, shaded, ray)
                     here = plane[0] * (column + 0.5) + plane[1] * (row + 0.5) + plane[2]
@@ -264,7 +277,7 @@ def shade_image(
                     if shaded <= 0:
                         shaded = 1 / close[slot]
                     colour = _ball_colour(around, mesh, view, number - faces, shaded, ray)
-                    here = ball_depth(mesh.balls, number - faces, view, column + 0.5, row + 0.5)
+                    here = shaded if same else ball_depth(mesh.balls, number - faces, view, column + 0.5, row + 0.5)
                     if here <= 0:
                         here = 1 / close[slot]
                 red, green, blue = red + part * colour[0], green + part * colour[1], blue + part * colour[2]

@@ -25,7 +25,10 @@ _OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "_nrt": False,
     "fastmath": {"reassoc", "contract", "arcp", "nsz"},
+    "no_cfunc_wrapper": True,
 }
+_INSIDE: dict[str, Any] = {"forceinline": True, "no_cpython_wrapper": True}
+"""Of parts, which Python never calls: compiling them takes less long without an entrance for it."""
 
 
 def kernel(function: Function) -> Function:
@@ -44,4 +47,4 @@ def part(function: Function) -> Function:
     The cache of a kernel notices changes of the kernel's own file only: after editing a part of another file, clear
     the compiled files (``__pycache__/*.nb?``) or touch the kernel's file.
     """
-    return cast(Function, numba.njit(forceinline=True, **_OPTIONS)(function))
+    return cast(Function, numba.njit(**_OPTIONS, **_INSIDE)(function))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +37,7 @@ def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float
     round_ones = ids >= len(mesh.counts)
     balls = mesh.balls[ids[round_ones] - len(mesh.counts)]
     if len(balls):
-        cosine, sine = np.cos(balls[:, 6]), np.sin(balls[:, 6])
+        cosine, sine = balls[:, 6], balls[:, 7]
         turn = np.zeros((len(balls), 3, 3))
         turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cosine, sine, -sine, cosine, 1
         turn /= balls[:, 3:6, None]
@@ -44,6 +47,38 @@ def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float
         inside = half**2 - square * ((start * start).sum(axis=1) - 1)
         distance[round_ones] = np.where(inside >= 0, (-half - np.sqrt(np.maximum(inside, 0))) / square, np.inf)
     return distance
+
+
+class _Sector(NamedTuple):
+    """A quarter of the sweep: the image it is looked up in, its rays, and the rows and columns of their pixels."""
+
+    camera_to_lidar: Float
+    chosen: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+
+
+@cache
+def _sweep() -> tuple[Float, NDArray[np.int64], tuple[_Sector, ...]]:
+    """Unit rays ``(n, 3)`` of a sweep, lidar frame, their rings, and its quarters."""
+    elevation = np.repeat(np.linspace(LOWEST, HIGHEST, BEAMS), AZIMUTHS)
+    azimuth = np.tile(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, BEAMS)
+    rays = np.stack(
+        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1
+    )
+    quarter = np.floor((azimuth + np.pi / 4) / (np.pi / 2)).astype(int) % 4
+    sectors = []
+    for number in range(4):
+        turn = number * np.pi / 2
+        right = np.array([np.cos(turn), -np.sin(turn), 0.0])
+        forward = np.array([np.sin(turn), np.cos(turn), 0.0])
+        camera_to_lidar = np.eye(4)
+        camera_to_lidar[:3, :3] = np.stack([right, [0.0, 0.0, -1.0], forward], axis=1)
+        chosen = np.flatnonzero(quarter == number)
+        local = rays[chosen] @ camera_to_lidar[:3, :3]
+        columns, rows = np.clip((local[:, :2] / local[:, 2:] + 1) * (_SIDE / 2), 0, _SIDE - 1).astype(int).T
+        sectors.append(_Sector(camera_to_lidar, chosen, rows, columns))
+    return rays, np.repeat(np.arange(BEAMS), AZIMUTHS), tuple(sectors)
 
 
 def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EGO) -> NDArray[np.float32]:
@@ -56,29 +91,16 @@ def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EG
     mesh, _, _ = renderer.mesh_at(frame_index)
     lidar_to_global = renderer.world.trajectory.ego_to_global[frame_index] @ lidar_to_ego
     origin = lidar_to_global[:3, 3]
-    elevation = np.repeat(np.linspace(LOWEST, HIGHEST, BEAMS), AZIMUTHS)
-    azimuth = np.tile(np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS, BEAMS)
-    ring = np.repeat(np.arange(BEAMS), AZIMUTHS)
-    rays = np.stack(
-        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=1
-    )
+    rays, ring, sectors = _sweep()
     rays_global = rays @ lidar_to_global[:3, :3].T
     distance, ids = np.full(len(rays), np.inf), np.full(len(rays), -1, dtype=np.int32)
-    sector = np.floor((azimuth + np.pi / 4) / (np.pi / 2)).astype(int) % 4
-    for number in range(4):
-        turn = number * np.pi / 2
-        right = np.array([np.cos(turn), -np.sin(turn), 0.0])
-        forward = np.array([np.sin(turn), np.cos(turn), 0.0])
-        camera_to_lidar = np.eye(4)
-        camera_to_lidar[:3, :3] = np.stack([right, [0.0, 0.0, -1.0], forward], axis=1)
-        half = _SIDE / 2
-        intrinsics = np.array([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]])
-        eye = Camera("lidar", _SIDE, _SIDE, intrinsics, lidar_to_ego @ camera_to_lidar)
-        _, buffer = renderer.rasterise(mesh, renderer.view(eye, frame_index), 1)
-        chosen = np.flatnonzero(sector == number)
-        local = rays[chosen] @ camera_to_lidar[:3, :3]
-        pixel = np.clip((local[:, :2] / local[:, 2:] + 1) * half, 0, _SIDE - 1).astype(int)
-        ids[chosen] = buffer[pixel[:, 1], pixel[:, 0]]
+    half = _SIDE / 2
+    intrinsics = np.array([[half, 0.0, half], [0.0, half, half], [0.0, 0.0, 1.0]])
+    for sector in sectors:
+        eye = Camera("lidar", _SIDE, _SIDE, intrinsics, lidar_to_ego @ sector.camera_to_lidar)
+        buffer = renderer.rasterise(mesh, renderer.view(eye, frame_index), 1).ids
+        chosen = sector.chosen
+        ids[chosen] = buffer[sector.rows, sector.columns]
         distance[chosen] = _hit_distance(mesh, ids[chosen], origin, rays_global[chosen])
     generator = np.random.default_rng([renderer.world.seed, 53, frame_index])
     noisy = distance + generator.normal(0, 0.015, len(distance))

@@ -41,7 +41,7 @@ class Mesh(NamedTuple):
         normals: ``(f, 3) float64``, outward.
         materials, owners: ``(f,) int64``: :class:`Material` and the solid's row.
         colours: ``(f, 3) float64``, linear albedo.
-        balls: ``(b, 7) float64``: centre, half axes, yaw.
+        balls: ``(b, 8) float64``: centre, half axes, cosine and sine of the yaw.
         ball_materials, ball_owners: ``(b,) int64``.
         ball_colours: ``(b, 3) float64``.
     """
@@ -268,7 +268,8 @@ def build_mesh(solids: Solids, rows: Integer) -> Mesh:
     colours = np.where(tints < 0, solids.colour[owners], tints)
 
     round_ones = np.array([int(row) for row in rows if solids.shape[row] == "ellipsoid"], dtype=np.int64)
-    balls = np.column_stack([solids.centre[round_ones], solids.size[round_ones] / 2, solids.yaw[round_ones]])
+    yaw = solids.yaw[round_ones]
+    balls = np.column_stack([solids.centre[round_ones], solids.size[round_ones] / 2, np.cos(yaw), np.sin(yaw)])
     return Mesh(
         corners, counts, normals, materials, owners, colours,
         balls, own[round_ones], round_ones, solids.colour[round_ones],

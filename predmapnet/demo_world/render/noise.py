@@ -22,5 +22,5 @@ def fractal_tile(roughness: float, seed: int = 7) -> NDArray[np.float32]:
     frequency[0, 0] = 1.0
     rough = np.fft.irfft2(np.fft.rfft2(white) / frequency**roughness, s=(TILE, TILE))
     rank = np.empty(TILE * TILE, dtype=np.float32)
-    rank[np.argsort(rough, axis=None, kind="stable")] = np.linspace(0.0, 1.0, TILE * TILE, dtype=np.float32)
+    rank[np.argsort(rough, axis=None)] = np.linspace(0.0, 1.0, TILE * TILE, dtype=np.float32)
     return rank.reshape(TILE, TILE)

@@ -20,6 +20,20 @@ NEAR = 0.12
 """Metres before the camera where faces are cut."""
 
 
+class ZBuffer(NamedTuple):
+    """Faces in sight of a camera.
+
+    Attributes:
+        nearness: ``(samples * height, samples * width) float32``, ``1 / depth``; 0 where there is no solid.
+        ids: the same shape, ``int32``: face, or number of faces plus ellipsoid; -1 where there is no solid.
+        planes: ``(f, 3) float64``, the :func:`face_plane` of each face that was drawn; others are not filled in.
+    """
+
+    nearness: Float32
+    ids: Integer32
+    planes: Float
+
+
 class View(NamedTuple):
     """A camera at one instant, as plain numbers.
 
@@ -130,12 +144,12 @@ def _rows_of(screen: Float, count: int, rows: int) -> tuple[int, int]:
 @kernel
 def draw_faces(
     corners: Float, counts: Integer, normals: Float, view: View, samples: int, scratch: Float, nearness: Float32,
-    ids: Integer32,
+    ids: Integer32, planes: Float,
 ) -> None:  # fmt: skip
     """Draw all faces of a mesh into a z-buffer ``(samples * height, samples * width)``.
 
     Of each sample ``nearness`` keeps the largest ``1 / depth`` and ``ids`` the face that has it, -1 for none;
-    ``scratch (18, 3)`` is overwritten.
+    ``scratch (18, 3)`` is overwritten, and ``planes (f, 3)`` receives the :func:`face_plane` of faces that are drawn.
     """
     screen = scratch[8:]
     rows, columns = nearness.shape
@@ -148,15 +162,20 @@ def draw_faces(
         count = _project_clipped(corners[face], counts[face], view, scratch)
         if count < 3:
             continue
+        left, right = 1e30, -1e30
         for index in range(count):
             screen[index, 0] *= samples
             screen[index, 1] *= samples
+            left, right = min(left, screen[index, 0]), max(right, screen[index, 0])
+        if right < 0 or left > columns:
+            continue
         plane = face_plane(corners, normals, face, view)
+        planes[face, 0], planes[face, 1], planes[face, 2] = plane
         top, bottom = _rows_of(screen, count, rows)
+        slope = plane[0] / samples
         for row in range(top, bottom):
             first, last = _span(screen, count, row + 0.5, columns)
             constant = plane[1] * (row + 0.5) / samples + plane[2]
-            slope = plane[0] / samples
             for column in range(first, last):
                 value = np.float32(slope * (column + 0.5) + constant)
                 if value > nearness[row, column]:
@@ -167,20 +186,20 @@ def draw_faces(
 @part
 def _ball_space(balls: Float, index: int, x: float, y: float, z: float) -> Vector:
     """A vector of the global frame, in units of an ellipsoid's half axes."""
-    cosine, sine = np.cos(balls[index, 6]), np.sin(balls[index, 6])
+    cosine, sine = balls[index, 6], balls[index, 7]
     u, v = (cosine * x + sine * y) / balls[index, 3], (cosine * y - sine * x) / balls[index, 4]
     return u, v, z / balls[index, 5]
 
 
 @part
-def ball_depth(balls: Float, index: int, view: View, x: float, y: float) -> float:
-    """Depth along the optical axis where the ray of pixel position (x, y) meets an ellipsoid, or -1."""
-    ray = pixel_ray(view, x, y)
-    position = view.position
+def ball_depth(balls: Float, index: int, view: View, px: float, py: float) -> float:
+    """Depth along the optical axis where the ray of pixel position (px, py) meets an ellipsoid, or -1."""
+    ray = pixel_ray(view, px, py)
     du, dv, dw = _ball_space(balls, index, ray[0], ray[1], ray[2])
-    su, sv, sw = _ball_space(
-        balls, index, position[0] - balls[index, 0], position[1] - balls[index, 1], position[2] - balls[index, 2]
-    )
+    x, y, z = (
+        view.position[0] - balls[index, 0], view.position[1] - balls[index, 1], view.position[2] - balls[index, 2],
+    )  # fmt: skip
+    su, sv, sw = _ball_space(balls, index, x, y, z)
     square, half = du * du + dv * dv + dw * dw, du * su + dv * sv + dw * sw
     inside = half * half - square * (su * su + sv * sv + sw * sw - 1)
     if inside < 0:
@@ -190,16 +209,17 @@ def ball_depth(balls: Float, index: int, view: View, x: float, y: float) -> floa
 
 @kernel
 def draw_balls(
-    balls: Float, leafy: Integer, first_id: int, view: View, samples: int, noise: Float32, nearness: Float32,
-    ids: Integer32,
+    balls: Float, leafy: Integer, order: Integer, first_id: int, view: View, samples: int, noise: Float32,
+    nearness: Float32, ids: Integer32,
 ) -> None:  # fmt: skip
-    """Draw ellipsoids ``(b, 7)``, the first of id ``first_id``; ``leafy (b,)`` ones have a ragged outline with gaps.
+    """Draw ellipsoids ``(b, 8)``, the first of id ``first_id``; ``leafy (b,)`` ones have a ragged outline with gaps.
 
-    ``noise`` is a tile in [0, 1]; the rest is as in :func:`draw_faces`.
+    ``order`` is that of drawing, quickest where near ones come first; ``noise`` is a tile in [0, 1]; the rest is as in
+    :func:`draw_faces`.
     """
     rows, columns = nearness.shape
     position, rotation = view.position, view.rotation
-    for index in range(len(balls)):
+    for index in order:
         radius = max(balls[index, 3], max(balls[index, 4], balls[index, 5]))
         x, y, z = position[0] - balls[index, 0], position[1] - balls[index, 1], position[2] - balls[index, 2]
         depth = -(x * rotation[0, 2] + y * rotation[1, 2] + z * rotation[2, 2])
@@ -207,14 +227,18 @@ def draw_balls(
         outside = su * su + sv * sv + sw * sw - 1
         if depth < -radius or outside < 0.02:
             continue
-        top, bottom = 0, rows
+        top, bottom, nearest = 0, rows, np.float32(1e30)
         if depth > 1.5 * radius:
             # The sphere around the ellipsoid, seen from outside: a bound that is never too small.
             down = -(x * rotation[0, 1] + y * rotation[1, 1] + z * rotation[2, 1])
             across = -(x * rotation[0, 0] + y * rotation[1, 0] + z * rotation[2, 0])
-            reach = radius * (1 + (abs(across) + abs(down)) / depth) / (depth - radius) * view.focal_y
-            middle = down / depth * view.focal_y + view.centre_y
+            reach = radius * (1 + (abs(across) + abs(down)) / depth) / (depth - radius)
+            middle, aside = down / depth * view.focal_y + view.centre_y, across / depth * view.focal_x + view.centre_x
+            if abs(aside - 0.5 * view.width) > 0.5 * view.width + reach * view.focal_x:
+                continue
+            reach *= view.focal_y
             top, bottom = max(0, int((middle - reach) * samples)), min(rows, int((middle + reach) * samples) + 1)
+            nearest = np.float32(1.0001 / (depth - radius))
         gx, gy, gz = rotation[0, 0] / view.focal_x, rotation[1, 0] / view.focal_x, rotation[2, 0] / view.focal_x
         eu, ev, ew = _ball_space(balls, index, gx, gy, gz)
         eu, ev, ew = eu / samples, ev / samples, ew / samples
@@ -234,13 +258,16 @@ def draw_balls(
                 first = max(0, int(np.ceil(max((-p1 + root) / p2, -1.0))))
                 last = min(columns, int(np.floor(min((-p1 - root) / p2, columns + 1.0))) + 1)
             for column in range(first, last):
+                before = nearness[row, column]
+                if before > nearest:
+                    continue
                 square, half = a0 + column * (2 * a1 + column * a2), b0 + column * b1
                 inside = half * half - square * outside
                 if inside < 0:
                     continue
                 inside = np.sqrt(inside)
                 hit = (-half - inside) / square
-                if hit <= NEAR or 1 / hit <= nearness[row, column]:
+                if hit <= NEAR or hit * before >= 1:
                     continue
                 if leafy[index] == 1:
                     step = column / samples

@@ -16,10 +16,11 @@ from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, pai
 from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
-from predmapnet.demo_world.render.raster import View, draw_balls, draw_faces, draw_mask
+from predmapnet.demo_world.render.raster import View, ZBuffer, draw_balls, draw_faces, draw_mask
 from predmapnet.demo_world.render.response import Response
+from predmapnet.demo_world.render.shading import facade_styles
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
-from predmapnet.demo_world.street.looks import Light, light_of
+from predmapnet.demo_world.street.looks import Light, as_numbers, light_of
 from predmapnet.demo_world.world import Solids, World
 from predmapnet.scenes import Camera, Rig
 
@@ -46,7 +47,7 @@ class _Moment:
     darkness: tuple[tuple[Float, NDArray[np.int64], int], ...]
 
 
-def _lamp_field(world: World) -> tuple[NDArray[np.float32], Float]:
+def _lamp_field(world: World) -> tuple[NDArray[np.float32], tuple[float, float]]:
     """Light of the street lamps on the ground, a cell per metre, and the position of cell (0, 0)."""
     positions = world.trajectory.ego_to_global[:, :2, 3]
     low, high = np.floor(positions.min(axis=0) - 130), np.ceil(positions.max(axis=0) + 130)
@@ -62,7 +63,7 @@ def _lamp_field(world: World) -> tuple[NDArray[np.float32], Float]:
             square = (x - (lamp[0] - low[0])) ** 2 + (y - (lamp[1] - low[1])) ** 2
             # Lambert's cosine and the inverse square of the distance, normalised below the lamp.
             window += (0.55 * (lamp[2] ** 2 / (square + lamp[2] ** 2)) ** 2).astype(np.float32)
-    return field, low
+    return field, (float(low[0]), float(low[1]))
 
 
 class Renderer:
@@ -99,21 +100,24 @@ class Renderer:
         self._sunlit = np.ones(len(solids.shape), dtype=np.float32)
         if self.light.sun.any():
             self._sunlit[:] = self._shadow_at(self._ground[0], solids.centre[:, :2], solids)
+        self._styles = facade_styles(len(solids.shape))
         self._lamps, self._lamps_origin = _lamp_field(world)
         self._response = Response() if response is None else response
         self._curve = self._response.tone_curve()
+        # Before threads ask for them, each of which would make its own.
+        self._white, self._fractal = fractal_tile(0.0, seed=8), fractal_tile(1.0)
+        self._clouds, self._leaves = fractal_tile(1.7, seed=12), fractal_tile(0.6, seed=10)
 
     @staticmethod
     def _shadow_at(ground: Pyramid, points: Float, solids: Solids) -> NDArray[np.float32]:
         """Share of sunlight just outside the sunward side of each solid, from the painted shadows."""
-        level = min(3, len(ground.rows) - 1)
+        level = min(3, ground.levels.shape[1] - 1)
         x0, y0, cosine, sine, per_metre = ground.placement
         delta = points - [x0, y0]
         column = ((cosine * delta[:, 0] + sine * delta[:, 1]) * per_metre).astype(int) >> level
         row = ((cosine * delta[:, 1] - sine * delta[:, 0]) * per_metre).astype(int) >> level
-        rows, columns = int(ground.rows[level]), int(ground.columns[level])
+        start, rows, columns = map(int, ground.levels[:, level])
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        start = int(ground.starts[level])
         shade = np.ones(len(points), dtype=np.float32)
         index = start + np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1)
         shade[inside] = ground.texels[index[inside], 3] / np.float32(255)
@@ -177,14 +181,16 @@ class Renderer:
         fx, fy, cx, cy = (float(camera.intrinsics[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
         return View(rotation, position, fx, fy, cx, cy, camera.width, camera.height)
 
-    def rasterise(self, mesh: Mesh, view: View, samples: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return the z-buffer of the solids: ``1 / depth`` and ids, ``(samples * height, samples * width)``."""
+    def rasterise(self, mesh: Mesh, view: View, samples: int) -> ZBuffer:
+        """Return the z-buffer of the solids, ``samples`` per pixel and direction."""
         nearness = np.zeros((view.height * samples, view.width * samples), dtype=np.float32)
         ids = np.full(nearness.shape, -1, dtype=np.int32)
-        draw_faces(mesh.corners, mesh.counts, mesh.normals, view, samples, np.empty((18, 3)), nearness, ids)
+        planes = np.empty_like(mesh.normals)
+        draw_faces(mesh.corners, mesh.counts, mesh.normals, view, samples, np.empty((18, 3)), nearness, ids, planes)
         leafy = (mesh.ball_materials == Material.FOLIAGE).astype(np.int64)
-        draw_balls(mesh.balls, leafy, len(mesh.counts), view, samples, fractal_tile(0.6, seed=10), nearness, ids)
-        return nearness, ids
+        order = np.argsort(((mesh.balls[:, :3] - view.position) ** 2).sum(axis=1))
+        draw_balls(mesh.balls, leafy, order, len(mesh.counts), view, samples, self._leaves, nearness, ids)
+        return ZBuffer(nearness, ids, planes)
 
     def render(self, camera: Camera, frame_index: int) -> RenderedImage:
         """Draw what a camera sees at a key frame; the same bytes for the same world, camera and frame.
@@ -196,18 +202,18 @@ class Renderer:
     def _draw(self, camera: Camera, frame_index: int, moment: _Moment) -> RenderedImage:
         mesh = moment.mesh
         view, samples = self.view(camera, frame_index), self.supersampling
-        nearness, ids = self.rasterise(mesh, view, samples)
+        solids = self.rasterise(mesh, view, samples)
         around = Surroundings(
-            *self._ground, self.light, fractal_tile(0.0, seed=8), fractal_tile(1.0), fractal_tile(1.7, seed=12),
+            *self._ground, as_numbers(self.light), self._white, self._fractal, self._clouds,
             self._lamps, self._lamps_origin, inverse_pose(self.world.trajectory.ego_to_global[frame_index]),
-            self._sunlit,
+            self._sunlit, self._styles,
         )  # fmt: skip
         size = (camera.height, camera.width)
         image = np.empty((*size, 3), dtype=np.float32)
         depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
         dynamic = self._dynamic_mask(view, moment)
         found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
-        shade_image(around, mesh, view, samples, 8, ids, nearness, dynamic, found, scratch, image, depth, ground_share)
+        shade_image(around, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth, ground_share)
         if self.light.wetness > 0:
             mirror_in_wet(around, view, ground_share, image)
         return RenderedImage(self._develop(image, camera, frame_index), depth)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 
 from mapfusion.arrays import Float, Float32
@@ -28,12 +30,12 @@ def _read_level(pyramid: Pyramid, level: int, x: float, y: float) -> Texel:
     """Albedo (linear) and shadow at texel position (x, y) of level 0, read bilinearly from ``level``."""
     scale = 1.0 / (1 << level)
     x, y = x * scale - 0.5, y * scale - 0.5
-    rows, columns = pyramid.rows[level], pyramid.columns[level]
+    rows, columns = pyramid.levels[1, level], pyramid.levels[2, level]
     column = min(max(int(np.floor(x)), 0), columns - 2)
     row = min(max(int(np.floor(y)), 0), rows - 2)
     u, v = np.float32(min(max(x - column, 0.0), 1.0)), np.float32(min(max(y - row, 0.0), 1.0))
     one = np.float32(1.0)
-    first = pyramid.starts[level] + row * columns + column
+    first = pyramid.levels[0, level] + row * columns + column
     below = first + columns
     texels = pyramid.texels
     w00, w01, w10, w11 = (one - u) * (one - v), u * (one - v), (one - u) * v, u * v
@@ -53,7 +55,7 @@ def _read_level(pyramid: Pyramid, level: int, x: float, y: float) -> Texel:
 @part
 def _read_sharp(pyramid: Pyramid, x: float, y: float, sharpness: float) -> Texel:
     """As above at level 0, with the edges of paint as crisp as a pixel: coverage is a distance in disguise."""
-    rows, columns = pyramid.rows[0], pyramid.columns[0]
+    rows, columns = pyramid.levels[1, 0], pyramid.levels[2, 0]
     x, y = x - 0.5, y - 0.5
     column = min(max(int(np.floor(x)), 0), columns - 2)
     row = min(max(int(np.floor(y)), 0), rows - 2)
@@ -108,7 +110,7 @@ def read_ground(
     place = fine.placement
     dx, dy = x - place[0], y - place[1]
     u, v = (place[2] * dx + place[3] * dy) * place[4], (place[2] * dy - place[3] * dx) * place[4]
-    in_fine = u > 2 and v > 2 and u < fine.columns[0] - 2 and v < fine.rows[0] - 2
+    in_fine = u > 2 and v > 2 and u < fine.levels[2, 0] - 2 and v < fine.levels[1, 0] - 2
     if not in_fine:
         place = coarse.placement
         dx, dy = x - place[0], y - place[1]
@@ -125,7 +127,7 @@ def read_ground(
     count = int(min(float(most), np.ceil(major / max(minor, 1.0))))
     step = major / count
     level = np.log2(max(1.0, max(minor, step)))
-    top = len(fine.rows) - 1
+    top = fine.levels.shape[1] - 1
     lower = min(int(level), top)
     share = level - lower
     if count < 2:
@@ -190,28 +192,37 @@ def _hash(a: int, b: int, c: int) -> float:
     return value / 65536.0
 
 
+def facade_styles(solids: int) -> Float:
+    """Return the style of each solid's facade, ``(solids, 6)``.
+
+    Trim, distances of windows and of floors, open shares of both, and whether there is a shop.
+    """
+    owner, choose = np.arange(solids), cast(Any, _hash).py_func
+    trim, wide = choose(owner, 3, 7), 0.32 + 0.38 * choose(owner, 17, 4)
+    pitch, floor = 1.9 + 2.2 * choose(owner, 5, 11), 2.9 + 0.8 * choose(owner, 13, 2)
+    high, shop = 0.42 + 0.22 * choose(owner, 19, 6), choose(owner, 23, 1) > 0.45
+    return np.column_stack([trim, pitch, floor, np.where(trim > 0.75, 0.9, wide), high, shop])
+
+
 @part
 def facade(
-    light: Light, fractal: Float32, owner: int, along: float, height: float, blur: float, red: float, green: float,
-    blue: float,
+    light: Light, fractal: Float32, styles: Float, owner: int, along: float, height: float, blur: float, red: float,
+    green: float, blue: float,
 ) -> tuple[float, float, float, float, float]:  # fmt: skip
     """A wall with rows of windows: its albedo, share of glass and light from inside.
 
     Args:
         light: for the share of lit windows.
         fractal: noise tile, for dirt.
-        owner: number of the building, which decides its style.
+        styles: of all solids; see :func:`facade_styles`.
+        owner: number of the building.
         along, height: metres along the wall and above the ground.
         blur: size of a pixel on the wall, metres.
         red, green, blue: albedo of the wall.
     """
-    style = _hash(owner, 3, 7)
-    pitch = 1.9 + 2.2 * _hash(owner, 5, 11)
-    floor = 2.9 + 0.8 * _hash(owner, 13, 2)
-    open_x, open_y = 0.32 + 0.38 * _hash(owner, 17, 4), 0.42 + 0.22 * _hash(owner, 19, 6)
-    if style > 0.75:
-        open_x = 0.9
-    shop = height < 3.6 and _hash(owner, 23, 1) > 0.45
+    style, pitch, floor = styles[owner, 0], styles[owner, 1], styles[owner, 2]
+    open_x, open_y = styles[owner, 3], styles[owner, 4]
+    shop = height < 3.6 and styles[owner, 5] > 0
     if shop:
         pitch, open_x, floor, open_y = 3.4, 0.82, 3.6, 0.72
         row = 0
@@ -234,7 +245,7 @@ def facade(
     lit = 0.0
     if _hash(owner + 31, row, column) < light.lit_windows * (2.0 if shop else 1.0):
         lit = glass * (0.25 + 0.75 * _hash(owner, column, row))
-    dark = 0.03 + 0.07 * _hash(owner, row * 3, column * 7)
+    dark = 0.03 + 0.07 * _hash(owner, row * 3, column * 7) if glass > 0 else 0.0
     return (
         red * dirt * (1 - glass) + dark * glass, green * dirt * (1 - glass) + dark * glass,
         blue * dirt * (1 - glass) + 1.15 * dark * glass, glass, lit,

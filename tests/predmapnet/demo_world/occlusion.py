@@ -46,7 +46,7 @@ def hidden_share(renderer: Renderer, rig: Rig, frame_index: int, roi: RegionOfIn
         ahead = depth > 0.5
         pixel = (local @ camera.intrinsics.T)[:, :2] / np.where(ahead, depth, 1.0)[:, None]
         framed = ahead & (pixel >= 0).all(axis=1) & (pixel < [camera.width, camera.height]).all(axis=1)
-        nearness, _ = renderer.rasterise(mesh, renderer.view(camera, frame_index), 1)
+        nearness = renderer.rasterise(mesh, renderer.view(camera, frame_index), 1).nearness
         column, row = np.floor(pixel[framed]).astype(int).T
         in_view |= framed
         seen[np.flatnonzero(framed)[nearness[row, column] * depth[framed] < 1.0]] = True

@@ -81,4 +81,4 @@ def _texel(pyramid, place):
     x0, y0, cosine, sine, per_metre = pyramid.placement
     dx, dy = place[0] - x0, place[1] - y0
     column, row = int((cosine * dx + sine * dy) * per_metre), int((cosine * dy - sine * dx) * per_metre)
-    return pyramid.texels[row * pyramid.columns[0] + column]
+    return pyramid.texels[row * pyramid.levels[2, 0] + column]
