@@ -107,7 +107,8 @@ def _render_frames(world: World, root: Path, rig: Rig, progress: Progress | None
         timestamp = int(world.trajectory.timestamps[index])
         for channel, rendered in renderer.render_frame(rig, index).items():
             path = root / sample_file_name(world.name, channel, timestamp)
-            _write_image(path, rendered.image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            image = np.asarray(cv2.cvtColor(rendered.image, cv2.COLOR_RGB2BGR), dtype=np.uint8)
+            _write_image(path, image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         _write_bytes(
             root / sample_file_name(world.name, LIDAR, timestamp), scan(renderer, index).astype("<f4").tobytes()
         )
