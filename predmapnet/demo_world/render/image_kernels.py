@@ -347,7 +347,7 @@ def develop(
     state = np.uint64(seed) * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
     spread = np.float32(1.0 / (1 << 8) / 0.408)
     # Single precision: a few bytes of a million come out one greyer or brighter than in double.
-    noise, brightest = np.float32(noise), np.float32(4095.0)
+    grain, brightest = np.float32(noise), np.float32(4095.0)
     steps, shot, dark, zero = np.float32(4095 / 1.25), np.float32(0.18), np.float32(0.004), np.float32(0.0)
     for row in range(height):
         y = (row + 0.5) / height - 0.5
@@ -362,6 +362,6 @@ def develop(
                 low = np.int32((mixed >> np.uint64(16 * channel)) & np.uint64(255))
                 high = np.int32((mixed >> np.uint64(16 * channel + 8)) & np.uint64(255))
                 random = np.float32(low + high - 255) * spread
-                value += random * noise * np.sqrt(max(value, zero) * shot + dark)
+                value += random * grain * np.sqrt(max(value, zero) * shot + dark)
                 index = np.int32(min(np.sqrt(max(value, zero)) * steps, brightest))
                 out[row, column, channel] = curve[index]
