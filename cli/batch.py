@@ -16,6 +16,7 @@ from cli.options import (
     Dataset,
     Device,
     Force,
+    Json,
     Origin,
     PrecisionOption,
     Rate,
@@ -82,6 +83,7 @@ def batch(
     ] = "geojson",
     crs: Crs = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Map many scenes, resuming where it stopped.
 
@@ -130,7 +132,7 @@ def batch(
     write_summary(folder, mapped)
     with folder.write("report.html") as temporary:
         temporary.write_text(folder_report(folder), encoding="utf-8")
-    shown.close(folder.link("summary.json"), folder.link("report.html"))
+    shown.close(folder.link("summary.json"), folder.link("report.html"), as_json)
     if shown.failed:
         raise typer.Exit(1)
 

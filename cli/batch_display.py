@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
-from cli.console import ProgressDisplay, out, print_whole, say_error
+from cli.console import ProgressDisplay, out, print_json, print_whole, printable, say_error
 
 if TYPE_CHECKING:
     from predmapnet.runs.batch_records import Outcome
@@ -68,15 +68,20 @@ class BatchDisplay:
         todo = self._total - self.done - self.failed
         return f", {_duration(todo * (monotonic() - self._began) / self._mapped)} left" if todo else ""
 
-    def close(self, summary: str, report: str) -> None:
-        """Print the table of a small batch, what failed, and the totals."""
-        if self._rows:
+    def close(self, summary: str, report: str, as_json: bool) -> None:
+        """Print the table of a small batch and the totals, or these as JSON, and what failed."""
+        if self._rows and not as_json:
             print_whole(_table(sorted(self._rows, key=lambda outcome: outcome.scene)))
         for outcome in self._failures:
             say_error(f"{outcome.scene}: {_reason(outcome)}")
         if self.failed > len(self._failures):
             say_error(f"and {self.failed - len(self._failures)} more; {report} names them all")
         seconds = monotonic() - self._began
+        if as_json:
+            counts = {"scenes": self._total, "done": self.done, "failed": self.failed, "mapped_now": self._mapped}
+            totals = {"elements": self._elements, "metres": self._metres, "frames": self._frames, "seconds": seconds}
+            print_json(counts | totals | {"written": [summary, report]})
+            return
         speed = f", {self._frames} frames at {self._frames / seconds:.1f}/s in all" if self._frames else ""
         out.print(
             f"{self.done} of {self._total} scenes are done: {self._elements} elements, {self._metres / 1000:.1f} km; "
@@ -90,10 +95,11 @@ def _line(outcome: Outcome) -> str:
     if outcome.report is None:
         return f"{outcome.scene}  FAILED: {_reason(outcome).splitlines()[0]}"
     elements, metres = sum(outcome.report["elements"].values()), sum(outcome.report["metres"].values())
-    return (
+    said = (
         f"{outcome.scene}  {elements} elements, {metres:.0f} m; {outcome.report['frames']} frames at "
         f"{outcome.report['frames_per_second']:.1f}/s, {_duration(outcome.seconds)}"
     )
+    return " ".join([said, *(f"({printable(note)})" for note in outcome.report.get("notes", ()))])
 
 
 def _reason(outcome: Outcome) -> str:

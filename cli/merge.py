@@ -80,9 +80,9 @@ def merge(
         screen.print("\n".join([*_choice_lines(report), _alignment_sentence(report)]), markup=False)
         screen.print("\n".join(f"written: {path}" for path in written), markup=False)
     if not sum(report.elements.values()):
-        say_warning(f"{out} is empty: none of the {counted(len(report.maps), 'map')} holds an element")
+        say_warning(f"{out} is empty: no element in {counted(len(report.maps), 'map')}")
     for status in report.maps:
-        if status.note:
+        if status.note and len(report.maps) > 1:
             kept = "kept apart, its elements are in the map as they are" if status.apart else "merged as it lies"
             say_warning(f"{status.name}: {kept}: {status.note}")
     for name, note in report.notes:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cli.options import Scheme, SplitScheme
+from cli.options import Json, Scheme, SplitScheme
 from predmapnet.machine import Precision
 
 
@@ -68,12 +68,14 @@ def train(
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")] = False,
     init: Annotated[Path | None, typer.Option(help="Weights to start from (safetensors).")] = None,
     cache: Annotated[Path | None, typer.Option(help="Folder of the training cache.", show_default=False)] = None,
+    as_json: Json = False,
 ) -> None:
     """Train the network; after an interruption, --resume continues.
 
     On a shared CPU, one process per core with one thread each is fastest. Several machines: torchrun.
     """
     import os
+    from functools import partial
 
     os.environ["OMP_NUM_THREADS"] = str(threads)
     # Otherwise torch warns that all modules had something to do in the first step.
@@ -81,6 +83,7 @@ def train(
 
     from rich.console import Console
 
+    from cli.console import print_json
     from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.presets import load_config
     from predmapnet.training import run
@@ -111,10 +114,18 @@ def train(
         initial=init,
     )
     if dry_run:
-        return Console().print(run.dry_run(options))
-    weights = run.train_network(options, typer.echo)
+        plan = run.dry_run(options)
+        if not as_json:
+            return Console().print(plan)
+        rows = zip(*(column.cells for column in plan.columns), strict=True)
+        headers = [column.header for column in plan.columns]
+        return print_json({"stages": [dict(zip(headers, row, strict=True)) for row in rows], "cache": plan.caption})
+    weights = run.train_network(options, partial(typer.echo, err=True) if as_json else typer.echo)
     if not leads():
         return None
+    if as_json:
+        print_json({"finished": weights is not None, "written": [] if weights is None else [weights]})
+        raise typer.Exit(0 if weights is not None else 130)
     if weights is None:
         typer.echo(f"Stopped. Go on with: predmapnet train --out {out} --resume (and the same options)")
         raise typer.Exit(130)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from cli.options import (
     DataRoot,
     Dataset,
     Device,
+    Json,
     PrecisionOption,
     Rate,
     Threads,
@@ -52,44 +54,54 @@ def view(
     compiled: Compile = False,
     threads: Threads = 0,
     allow_missing_cameras: AllowMissingCameras = False,
+    as_json: Json = False,
 ) -> None:
     """Look at scenes, recordings and maps in Rerun.
 
-    Without a display, a recording is written instead, and the command prints how to open it.
+    Without a display, a recording is written instead, and the command prints how to open it. --json is for --out.
     """
-    from cli.console import err, progress_display, say_report, say_warning, warn_of_weights
+    from cli.console import err, print_json, progress_display, say_notes, say_report, warn_of_weights
     from cli.viewer import WebOptions, open_viewer, show_file
     from mapfusion.diff_files import holds_differences
-    from predmapnet.errors import value_errors_told
+    from predmapnet.errors import UserError, value_errors_told
     from predmapnet.files import check_output
     from predmapnet.runs.outputs import Outputs
     from predmapnet.sources import folder_named
 
     browser = WebOptions(bind, port) if web else None
+    if web and out is not None:
+        raise UserError("--web shows it and --out writes it: give one of them")
+    if as_json and out is None:
+        raise UserError("--json tells what was written: it needs --out")
     if out is not None:
         check_output(out, (".rrd",), [Path(one) for one in what])
     name = Path(what[0]).resolve().stem
     if what[0].lower().endswith(".rrd") and len(what) == 1:
+        if out is not None:
+            raise UserError(f"{what[0]} is a recording already: leave out --out")
         show_file(Path(what[0]), browser)
         return
     if what[0].lower().endswith(".parquet") and len(what) <= 2:
         from predmapnet.recording import log_frames
 
-        with open_viewer(name, browser, out) as recording:
-            for note in log_frames(recording, Path(what[0]), what[1] if len(what) == 2 else None, track):
-                say_warning(note)
+        with open_viewer(name, browser, out, quiet=as_json) as recording:
+            notes = log_frames(recording, Path(what[0]), what[1] if len(what) == 2 else None, track)
+            say_notes(notes, {})
+        if as_json:
+            print_json({"written": [out], "notes": list(notes)})
         return
     folder = folder_named(what[0], dataset) if len(what) == 1 else None
     if folder is None and (maps := map_files(what)):
         from predmapnet.recording import log_changes, log_differences, log_maps
 
-        with open_viewer(name, browser, out) as recording, value_errors_told():
+        with open_viewer(name, browser, out, quiet=as_json) as recording, value_errors_told():
             if len(what) == 1 and holds_differences(maps[0]):
                 notes = log_differences(recording, maps[0])
             else:
                 notes = (log_changes if len(what) == 2 == len(maps) else log_maps)(recording, maps)
-            for note in notes:
-                say_warning(note)
+            say_notes(notes, {})
+        if as_json:
+            print_json({"written": [out], "notes": list(notes)})
         return
     use_threads(threads)
     from predmapnet.runs.infer import MappingPipeline
@@ -99,7 +111,7 @@ def view(
     pipeline = MappingPipeline.open(dataset, data_root, network, allow_missing_cameras, rate=rate)
     err.print(pipeline.sentence, markup=False)
     warn_of_weights(pipeline)
-    with open_viewer(name, browser, out, live=True) as recording:
+    with open_viewer(name, browser, out, live=True, quiet=as_json) as recording:
         with progress_display() as display:
             mapped = pipeline.run(
                 None if folder else what[0],
@@ -109,7 +121,10 @@ def view(
                 viewer=recording,
                 track=track,
             )
-        say_report(mapped.report)
+        if not as_json:
+            say_report(mapped.report)
+    if as_json:
+        say_report(replace(mapped.report, written=(str(out),)), as_json)
 
 
 def map_files(named: list[str]) -> list[Path]:

@@ -60,7 +60,7 @@ def has_display() -> bool:
 
 @contextlib.contextmanager
 def open_viewer(
-    name: str, web: WebOptions | None, file: Path | None, live: bool = False
+    name: str, web: WebOptions | None, file: Path | None, live: bool = False, quiet: bool = False
 ) -> Iterator[rr.RecordingStream]:
     """Yield a Rerun stream that shows on the web, in a file, or in a window if there is a display.
 
@@ -69,6 +69,7 @@ def open_viewer(
         web: serve it until Ctrl-C.
         file: write a recording here instead.
         live: whether there is something to watch before the block ends.
+        quiet: leave it to the caller to say what was written.
     """
     recording = rr.RecordingStream(APPLICATION, recording_id=name)
     if web is not None:
@@ -83,6 +84,8 @@ def open_viewer(
         check_output(path, (".rrd",))
         with RecordingFile(recording, path):
             yield recording
+        if quiet:
+            return
         if file is None:
             out.print("There is no display here, so the recording was written to a file.")
         out.print(f"written: {path}", markup=False)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from predmapnet.mapper import Mapper
     from predmapnet.mapping import NETWORK_ERRORS, map_scene
     from predmapnet.presets import PRESETS, preset
+    from predmapnet.scenes import Camera, Frame
     from predmapnet.sources import open_source
 
 __version__ = "0.1.0"
@@ -24,7 +25,9 @@ __version__ = "0.1.0"
 __all__ = [
     "NETWORK_ERRORS",
     "PRESETS",
+    "Camera",
     "ElementKind",
+    "Frame",
     "FrameMap",
     "GlobalMap",
     "MapElement",
@@ -53,6 +56,7 @@ _MODULES = {
     "predmapnet.mapper": ("Mapper",),
     "predmapnet.mapping": ("NETWORK_ERRORS", "map_scene"),
     "predmapnet.presets": ("PRESETS", "preset"),
+    "predmapnet.scenes": ("Camera", "Frame"),
     "predmapnet.sources": ("open_source",),
 }
 

@@ -107,12 +107,12 @@ class Mapper:
         """
         images: dict[str, Image] = {}
         for camera in frame.rig:
-            path = frame.images.get(camera.name)
-            if path is None or not path.exists():
+            image = frame.images.get(camera.name)
+            if image is None or (isinstance(image, Path) and not image.exists()):
                 if not allow_missing_cameras:
-                    raise UserError(_missing_camera(frame, camera.name, path))
+                    raise UserError(_missing_camera(frame, camera.name, image))
                 continue
-            images[camera.name] = read_camera_image(path, camera)
+            images[camera.name] = read_camera_image(image, camera)
         if not images:
             raise UserError(
                 f"Frame {frame.index} of {frame.scene} has no image of any camera: there is nothing to map."

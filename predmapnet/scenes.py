@@ -95,7 +95,8 @@ class Frame:
         ego_to_global: ``(4, 4) float64``; on nuScenes the ego origin lies at the lidar's x, y, as in the
             official vector-map data sets.
         rig: the cameras of the car, always all of them.
-        images: image files by camera name. A camera without an image is absent.
+        images: by camera name, image files or pixels ``(height, width, 3) uint8``, RGB, as the camera took them. A
+            camera without an image is absent.
         missing: why there is no image, by name of the camera.
     """
 
@@ -105,7 +106,7 @@ class Frame:
     timestamp: int
     ego_to_global: Float
     rig: Rig
-    images: Mapping[str, Path]
+    images: Mapping[str, Path | Image]
     missing: Mapping[str, str] = field(default_factory=dict)
 
 

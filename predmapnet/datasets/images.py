@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from predmapnet.datasets.undistortion import undistorted
 from predmapnet.errors import UserError
-from predmapnet.scenes import Camera
+from predmapnet.scenes import Camera, Image
 
 _JPEG_START = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
@@ -52,17 +52,22 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     return np.asarray(image, dtype=np.uint8)
 
 
-def read_camera_image(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Read an image of a camera, undistorted: ``(camera.height, camera.width, 3) uint8``, RGB.
+def read_camera_image(stored_image: Path | Image, camera: Camera) -> Image:
+    """Return an image of a camera, from a file or as an array, undistorted: ``(camera.height, camera.width, 3)``, RGB.
 
     Raises:
         UserError: as :func:`read_image`, or the image has not the size that its camera is calibrated for.
     """
-    image = read_image(path)
+    if isinstance(stored_image, Path):
+        image, name = read_image(stored_image), f"The image {stored_image}"
+    else:
+        image, name = stored_image, f"An image of {camera.name}"
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise UserError(f"{name} is {image.dtype} {image.shape}, not uint8 (height, width, 3), RGB.")
     stored = camera if camera.lens is None else camera.lens
     if image.shape[:2] != (stored.height, stored.width):
         raise UserError(
-            f"The image {path} has {image.shape[1]} x {image.shape[0]} pixels, "
+            f"{name} has {image.shape[1]} x {image.shape[0]} pixels, "
             f"but the calibration of its camera is for {stored.width} x {stored.height}."
         )
     return undistorted(image, camera)

@@ -125,7 +125,7 @@ class Measurement:
         found = []
         if self.absent_frames:
             found.append(f"{self.absent_frames} of {len(self.frames)} frames are not in the results and count as empty")
-        absent = [kind.kind.label for kind in self.chamfer.kinds if not kind.truths]
+        absent = [kind.kind.nouns for kind in self.chamfer.kinds if not kind.truths]
         if absent:
             found.append(
                 f"no ground truth of {', '.join(absent)}: counts as 0 in every mean over the kinds but raster's"

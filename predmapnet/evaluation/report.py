@@ -196,7 +196,7 @@ def _figure(drawing: str, caption: str) -> str:
 
 def _curve_caption(kind: KindResult) -> str:
     steps = ", ".join(f"{curve.average_precision:.3f} at {curve.threshold:g} m" for curve in kind.curves)
-    return f"{kind.kind.label}: {steps}"
+    return f"{kind.kind.nouns}: {steps}"
 
 
 def _legend() -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mapfusion.array_files import read_arrays
 from mapfusion.elements import ElementKind
 from predmapnet.config import LookupBevConfig, PredMapNetConfig
-from predmapnet.datasets.images import read_image
+from predmapnet.datasets.images import read_camera_image
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.demo_world.training_drive import training_drive
 from predmapnet.errors import UserError
@@ -141,8 +141,9 @@ def _origin(frame: Frame, arrays: Mapping[str, NDArray[Any]]) -> NDArray[np.uint
     digest = sha256(repr(JPEG_OPTIONS).encode())
     for camera in frame.rig:
         path = frame.images.get(camera.name)
-        file = (path.name, path.stat().st_size) if path is not None and path.is_file() else None
+        file = (path.name, path.stat().st_size) if isinstance(path, Path) and path.is_file() else None
         digest.update(repr((camera.name, camera.width, camera.height, file)).encode())
+        digest.update(b"" if camera.lens is None else repr(camera.lens).encode())
     for name, array in arrays.items():
         digest.update(name.encode() + np.ascontiguousarray(array).tobytes())
     return np.frombuffer(digest.digest(), np.uint8)
@@ -152,16 +153,11 @@ def _readable_images(frame: Frame) -> tuple[dict[str, Image], list[str]]:
     """Images by camera, and what is wrong with those that should be there."""
     images, problems = {}, [str(problem) for problem in frame.missing.values()]
     for camera in frame.rig:
-        path = frame.images.get(camera.name)
-        try:
-            image = None if path is None else read_image(path)
-        except UserError as error:
-            problems.append(str(error))
-            continue
-        if image is not None and image.shape[:2] == (camera.height, camera.width):
-            images[camera.name] = image
-        elif image is not None:
-            problems.append(f"{path} has not the {camera.width} x {camera.height} pixels of its calibration.")
+        if camera.name in frame.images:
+            try:
+                images[camera.name] = read_camera_image(frame.images[camera.name], camera)
+            except UserError as error:
+                problems.append(str(error))
     return images, problems
 
 

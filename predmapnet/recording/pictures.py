@@ -35,12 +35,13 @@ class Pictures:
         self._share = FRAME_BYTES // max(1, len(rig))
         self._quality = dict.fromkeys(self._cameras, 0)
 
-    def encoded(self, name: str, path: Path) -> rr.EncodedImage:
-        """Return the picture of a camera from the image in a file."""
+    def encoded(self, name: str, stored: Path | Image) -> rr.EncodedImage:
+        """Return the picture of a camera from its image, a file or an array."""
         camera, small = self._cameras[name]
-        if camera.lens is None and camera.width == small.width and path.stat().st_size <= self._share:
-            return rr.EncodedImage(path=path)
-        image = read_camera_image(path, camera)
+        fits = camera.lens is None and camera.width == small.width
+        if isinstance(stored, Path) and fits and stored.stat().st_size <= self._share:
+            return rr.EncodedImage(path=stored)
+        image = read_camera_image(stored, camera)
         if small.width < camera.width:
             image = np.asarray(cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA), np.uint8)
         content = b""

@@ -165,11 +165,11 @@ class SceneRecorder:
     def _log_cameras(self, frame: Frame, tracks: Tracks) -> None:
         for camera in self._pictures.rig:
             entity = f"world/ego_vehicle/{camera.name}"
-            path = frame.images.get(camera.name)
-            if path is None:
+            image = frame.images.get(camera.name)
+            if image is None:
                 self._recording.log(entity, rr.Clear(recursive=True))
                 continue
-            self._recording.log(entity, self._pictures.encoded(camera.name, path))
+            self._recording.log(entity, self._pictures.encoded(camera.name, image))
             strips, colours, labels = [], [], []
             found = tracks.frame_map
             for kind, points, label in zip(found.kinds, found.polylines, tracks.labels, strict=True):

@@ -110,6 +110,8 @@ def run_stages(fabric: Fabric, options: RunOptions, data: PreparedData | None, r
     if options.resume:
         trainer.resume()
     stages = choose_stages(options.config, options.stage)
+    if all(stage.name in trainer.position.finished for stage in stages):
+        report(f"Nothing to train: all stages of {options.folder} were finished before.")
     frames = round(sum(len(scene) * weight for scene, weight in zip(scenes.scenes, scenes.weights, strict=True)))
 
     def measure(measured: PredMapNet, stage: Stage) -> dict[str, float]:

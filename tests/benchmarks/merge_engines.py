@@ -31,20 +31,25 @@ JOBS = 2
 
 @dataclass(frozen=True)
 class Timed:
-    """Work that returns its result with CPU and wall seconds."""
+    """Work that returns its result with seconds: CPU of the worker, CPU of the thread that works, and wall."""
 
     begin: Begin
 
-    def __call__(self) -> Callable[[Any], tuple[Any, float, float]]:
+    def __call__(self) -> Callable[[Any], tuple[Any, tuple[float, float, float]]]:
         """Begin the work itself."""
         work = self.begin()
 
-        def timed(task: Any) -> tuple[Any, float, float]:
-            cpu, wall = time.process_time(), time.perf_counter()
+        def timed(task: Any) -> tuple[Any, tuple[float, float, float]]:
+            began = _clocks()
             result = work(task)
-            return result, time.process_time() - cpu, time.perf_counter() - wall
+            cpu, thread, wall = (now - then for now, then in zip(_clocks(), began, strict=True))
+            return result, (cpu, thread, wall)
 
         return timed
+
+
+def _clocks() -> tuple[float, float, float]:
+    return time.process_time(), time.thread_time(), time.perf_counter()
 
 
 class Stopwatch:
@@ -52,14 +57,14 @@ class Stopwatch:
 
     def __init__(self, executor: Executor) -> None:
         self._executor = executor
-        self.cpu = self.wall = 0.0
+        self.cpu = self.thread = self.wall = 0.0
 
     def run(self, begin: Begin, tasks: Iterable[Any]) -> Iterator[Finished]:
         """Yield the ends of the tasks as they come."""
         for finished in self._executor.run(Timed(begin), tasks):
             if finished.error is None:
-                result, cpu, wall = finished.result
-                self.cpu, self.wall = self.cpu + cpu, self.wall + wall
+                result, (cpu, thread, wall) = finished.result
+                self.cpu, self.thread, self.wall = self.cpu + cpu, self.thread + thread, self.wall + wall
                 finished = replace(finished, result=result)
             yield finished
 
@@ -97,7 +102,8 @@ def main() -> None:
                     own, wall = engine_seconds() - began, time.perf_counter() - wall
                 total.append(watch.cpu + own)
                 print(
-                    f"{engine}: {len(paths)} maps, tasks {watch.cpu:.1f} CPU s, the command and its engine {own:.1f} "
+                    f"{engine}: {len(paths)} maps, tasks {watch.cpu:.1f} CPU s "
+                    f"({watch.cpu - watch.thread:.1f} in other threads), the command and its engine {own:.1f} "
                     f"CPU s; {wall:.0f} s wall, workers at work {100 * watch.wall / (JOBS * wall):.0f} % of it",
                     flush=True,
                 )

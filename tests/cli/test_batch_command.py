@@ -103,12 +103,18 @@ def test_a_manifest_names_scenes_of_several_folders_and_the_summary_keeps_all_of
     predmapnet, data, random_weights, tmp_path
 ):
     write_tiny_nuscenes(tmp_path / "other", ("scene-0007",), frames=2)
+    image_path(tmp_path / "other", "scene-0007", 1, "CAM_BACK").unlink()
     (tmp_path / "list.csv").write_text("scene,folder\nscene-0001,data\nscene-0007,other\nscene-0009,other\n")
-    result = predmapnet("batch", "list.csv", "--out", "maps", "--weights", random_weights)
+    result = predmapnet("batch", "list.csv", "--out", "maps", "--weights", random_weights, "--allow-missing-cameras")
     assert result.code == 1
     assert "scene-0009" in result.err
-    again = predmapnet("batch", "scene-*2", "--out", "maps", *settings(data, random_weights))
+    (line,) = (line for line in result.err.splitlines() if "scene-0007  " in line)
+    assert "Images are missing (CAM_BACK in 1 of 2 frames)" in line
+    again = predmapnet("batch", "scene-*2", "--out", "maps", "--json", *settings(data, random_weights))
     assert again.code == 0, again.err
+    told = json.loads(again.out)
+    assert (told["scenes"], told["done"], told["failed"], told["frames"]) == (1, 1, 0, 4)
+    assert [Path(file).name for file in told["written"]] == ["summary.json", "report.html"]
     assert sorted(path.stem for path in (tmp_path / "maps").glob("*.geojson")) == [
         "scene-0001",
         "scene-0002",

@@ -66,7 +66,12 @@ def test_without_a_display_a_scene_is_recorded_and_view_says_how_to_look(
 def test_a_map_can_be_looked_at_and_a_broken_one_is_told(predmapnet, tiny_root, random_weights, tmp_path):
     settings = ("--data-root", tiny_root, "--weights", random_weights, "--threads", 1)
     assert predmapnet("infer", "scene-0001", "--out", "map.geojson", *settings).code == 0
-    assert predmapnet("view", "map.geojson", "--out", "map.rrd").code == 0
+    seen = predmapnet("view", "map.geojson", "--out", "map.rrd", "--json")
+    assert (seen.code, json.loads(seen.out)) == (0, {"written": ["map.rrd"], "notes": []})
+    assert json.loads(predmapnet("report", "map.geojson", "--out", "r.html", "--json").out) == {"written": ["r.html"]}
+    for options in (("map.rrd", "--out", "copy.rrd"), ("map.geojson", "--web", "--out", "x.rrd"), ("maps", "--json")):
+        assert predmapnet("view", *options).code == 2
+    assert not Path("copy.rrd").exists() and not Path("x.rrd").exists()
     verify = [sys.executable, "-m", "rerun", "rrd", "verify", tmp_path / "map.rrd"]
     assert subprocess.run(verify, timeout=300, capture_output=True).returncode == 0
     Path("broken.geojson").write_text("{")

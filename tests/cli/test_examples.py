@@ -34,6 +34,13 @@ def test_mapping_a_scene_and_drawing_it(tiny_root, random_weights, tmp_path, mon
     assert drawn.findall("{http://www.w3.org/2000/svg}polyline")
 
 
+def test_images_in_memory_become_a_map(random_weights, tmp_path, capsys):
+    script = runpy.run_path(str(EXAMPLES / "05_map_your_own_images.py"))
+    script["main"](tmp_path / "map.geojson", random_weights)
+    assert capsys.readouterr().out.count("tracks") == 8
+    assert json.loads((tmp_path / "map.geojson").read_text())["features"]
+
+
 def test_fusing_own_polylines_averages_their_errors_out(capsys):
     global_map = runpy.run_path(str(EXAMPLES / "01_fuse_polylines.py"))["main"]()
     (divider,) = global_map

@@ -38,6 +38,12 @@ def test_the_help_of_a_command_is_whole_at_80_columns(predmapnet, monkeypatch, w
                 assert option in result.out
 
 
+def test_every_command_speaks_json():
+    assert [
+        words for words, found in every_command().items() if "--json" not in str([p.opts for p in found.params])
+    ] == []
+
+
 def test_the_first_help_tells_the_exit_codes_and_installs_completion(predmapnet, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     said = predmapnet("--help").out

@@ -15,6 +15,8 @@ def test_a_dry_run_prints_the_plan_and_makes_nothing(predmapnet, tmp_path):
     assert all(part in single for part in ("24", str(24 * (4000 // 12)), "0.00141", "GiB"))
     unbroken = "".join(plan.out.split())
     assert re.search(r"cacheof2\d{4}imagesin\S+takesabout0\.[2-4]GB", unbroken)
+    told = json.loads(predmapnet("train", "--dry-run", "--towns", "100", "--batch", "12", "--json").out)
+    assert [stage["stage"] for stage in told["stages"]] == ["single", "temporal"]
     assert not (tmp_path / "runs").exists() and not (tmp_path / "cache" / "training").exists()
 
 
@@ -41,5 +43,7 @@ def test_a_data_set_is_learned_and_what_is_finished_stays_so(predmapnet, tmp_pat
     lines = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [(line["stage"], line["frames"]) for line in lines if "loss" in line] == [("single", 2), ("temporal", 6)]
     assert "holds a run already" in " ".join(predmapnet(*arguments).err.split())
-    assert predmapnet(*arguments, "--resume").code == 0
+    again = predmapnet(*arguments, "--resume", "--json")
+    assert (again.code, json.loads(again.out)["written"]) == (0, ["run/weights.safetensors"])
+    assert "Nothing to train" in again.err and "Nothing to train" not in first.out + first.err
     assert len((tmp_path / "run" / "metrics.jsonl").read_text().splitlines()) == len(lines)

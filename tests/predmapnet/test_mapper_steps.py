@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from predmapnet.datasets.images import read_image
 from predmapnet.datasets.nuscenes_tables import NUSCENES_CAMERAS
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
@@ -145,12 +146,24 @@ def test_a_network_that_knows_its_cameras_by_name_takes_any_of_them_in_any_order
         )
 
 
-def test_an_image_of_another_size_is_refused(mapper, logs, tmp_path):
-    path = tmp_path / "small.png"
-    cv2.imwrite(str(path), np.zeros((90, 160, 3), np.uint8))
+def test_an_image_of_another_size_or_type_is_refused(mapper, logs, tmp_path):
+    path, black = tmp_path / "small.png", np.zeros((450, 800, 3), np.uint8)
+    cv2.imwrite(str(path), black[:90, :160])
     frame = logs["a"][0]
-    with pytest.raises(UserError, match=r"small\.png has 160 x 90 pixels.* 800 x 450"):
-        mapper.step(replace(frame, images={**frame.images, "CAM_FRONT": path}))
+    for image, words in (
+        (path, r"small\.png has 160 x 90 pixels.* 800 x 450"),
+        (black[:90, :160], "CAM_FRONT has 160 x 90 pixels.* 800 x 450"),
+        (black.astype(np.float32), "CAM_FRONT is float32"),
+        (black[:, :, 0], "height, width, 3"),
+    ):
+        with pytest.raises(UserError, match=words):
+            mapper.step(replace(frame, images={**frame.images, "CAM_FRONT": image}))
+
+
+def test_pixels_give_the_same_as_their_files(mapper, logs):
+    frames = [replace(frame, images={n: read_image(p) for n, p in frame.images.items()}) for frame in logs["a"][:2]]
+    for ours, expected in zip(run(mapper, frames), run(mapper, logs["a"][:2]), strict=True):
+        same(ours, expected)
 
 
 def test_cameras_that_do_not_move_are_projected_once_and_others_anew(mapper):
