@@ -124,7 +124,7 @@ def view(
         if not as_json:
             say_report(mapped.report)
     if as_json:
-        say_report(replace(mapped.report, written=(str(out),)), as_json)
+        say_report(replace(mapped.report, written=(out,)), as_json)
 
 
 def map_files(named: list[str]) -> list[Path]:

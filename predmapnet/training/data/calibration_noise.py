@@ -22,9 +22,9 @@ class CalibrationNoise:
         metres: standard deviation of each camera's position along each axis.
     """
 
-    probability: float = 0.5
-    degrees: float = 0.5
-    common_degrees: float = 0.3
+    probability: float = 0.6
+    degrees: float = 0.75
+    common_degrees: float = 0.4
     metres: float = 0.02
 
 

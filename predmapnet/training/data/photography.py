@@ -16,9 +16,9 @@ import numpy as np
 from mapfusion.arrays import Byte, Float32
 
 DISPLAY_GAMMA = 2.2
-EXTREME_SHARE = 0.45
+EXTREME_SHARE = 0.5
 """Share of the frames whose exposure may take any value; that of the others lies around what it was."""
-DARK_SIDE = 1.7
+DARK_SIDE = 1.3
 """Exposures fall that many times as far as they rise (as logarithms): too bright an image is empty sooner."""
 
 
@@ -27,7 +27,7 @@ class PhotographySettings:
     """Differences between cameras. Every field may be zero, which switches its effect off.
 
     Attributes:
-        exposure: largest rise of the exposure, natural logarithm of linear light; it falls by up to 1.7 times that.
+        exposure: largest rise of the exposure, natural logarithm of linear light; it falls by up to 1.3 times that.
         camera_exposure: standard deviation of the exposure between the cameras of a frame, as a logarithm.
         colour: standard deviation of the white balance, as a logarithm of linear light.
         tone: standard deviation of the tone curve's gamma, as a logarithm; contrast varies by as much.
@@ -42,7 +42,7 @@ class PhotographySettings:
         dirt: probability of a smeared spot on a camera's lens.
     """
 
-    exposure: float = 1.5
+    exposure: float = 2.0
     camera_exposure: float = 0.15
     colour: float = 0.10
     tone: float = 0.22
@@ -63,8 +63,8 @@ def tone_tables(cameras: int, settings: PhotographySettings, generator: np.rando
     balance = settings.colour * generator.standard_normal((1, 1, 3))
     balance = balance - balance.mean() + 0.15 * settings.colour * generator.standard_normal((cameras, 1, 3))
     linear = (np.arange(256) / 255)[None, :, None] ** DISPLAY_GAMMA * np.exp(exposure + balance)
-    # A film-like shoulder keeps some of what is too bright; without it whites are cut off.
-    shoulder = generator.uniform(0.0, 0.8) if settings.tone > 0 else 0.0
+    # A film-like shoulder keeps some of what is too bright; without it, as in half of the frames, whites are cut off.
+    shoulder = max(0.0, generator.uniform(-0.8, 0.8)) if settings.tone > 0 else 0.0
     knee = 1.0 - 0.6 * shoulder
     over = np.maximum(linear - knee, 0.0)
     room = 1.0 - knee
