@@ -123,7 +123,7 @@ def view(
             )
         if not as_json:
             say_report(mapped.report)
-    if as_json:
+    if out is not None and as_json:
         say_report(replace(mapped.report, written=(out,)), as_json)
 
 
