@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -96,6 +98,13 @@ def test_damaged_missing_and_pickled_files_are_refused(saved, tmp_path):
     trap.write_bytes(pickle.dumps({"state_dict": {}}))
     with pytest.raises(UserError, match="has to be imported first"):
         load_checkpoint(trap)
+
+
+def test_weights_that_fit_are_read_without_the_compiler():
+    """It takes two seconds to import, and every command that maps would wait for it."""
+    code = "import sys; from predmapnet.weights.checkpoint import load_checkpoint as load; load(); print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert "torch" in modules and "torch._dynamo" not in modules
 
 
 def test_a_failed_write_leaves_no_file(network, tmp_path):
