@@ -8,13 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from predmapnet.config import BevFormerConfig, DepthConfig, PredMapNetConfig
 from predmapnet.network.image_input import input_size, window_camera
 from predmapnet.network.maptracker.reference_points import LEVEL_STRIDES
 from predmapnet.network.small.backbone import STRIDE
 from predmapnet.scenes import Camera, Rig
-
-Float = NDArray[np.float64]
 
 UNKNOWN = -1
 """Target of a cell without a point."""
