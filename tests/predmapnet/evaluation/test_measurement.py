@@ -181,7 +181,7 @@ def test_a_kind_that_a_scene_lacks_is_no_part_of_its_figures():
     assert figures["chamfer_mAP"] == pytest.approx(1.0)
     assert figures["mAS"] == pytest.approx(0.5), "both ends of the kerb lie outside the window of the localisation"
     assert pool_scenes([scene]).chamfer.mean == pytest.approx(1 / 3)
-    assert any("no ground truth of ped_crossing, divider" in text for text in pool_scenes([scene]).missing())
+    assert any("no ground truth of crossings, dividers" in text for text in pool_scenes([scene]).missing())
     assert figures["map_f1@1.0"] is None and figures["global_mAP"] is None
 
 
