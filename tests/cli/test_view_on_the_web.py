@@ -55,9 +55,15 @@ def wait_until(condition, seconds: float = 90.0) -> bool:
     return False
 
 
+def heed_interrupts():
+    """Undo what a shell does to commands in the background: they would not hear Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def served(what: Path, port: int, *options: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "cli.main", "view", str(what), "--web", "--port", str(port), *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heed_interrupts)
     first = process.stdout.readline()  # comes when everything is drawn
     assert first.startswith("Open http://"), process.stderr.read()
     return process
