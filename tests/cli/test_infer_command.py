@@ -20,6 +20,7 @@ from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import save_checkpoint
 from predmapnet.weights.files import weights_hash
 from tests.cli.tiny_nuscenes import edit_table, image_path, write_tiny_nuscenes
+from tests.interrupts import heed_interrupts
 from tests.predmapnet.small_networks import small_config
 
 
@@ -244,11 +245,6 @@ def test_a_folder_that_cannot_be_written_to_is_told_first(infer):
     assert result.code == 2
     assert "cannot write /proc/map.geojson" in result.err
     assert "no-such-scene" not in result.err
-
-
-def heed_interrupts():
-    """Undo what a shell does to commands in the background: they would not hear Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_ctrl_c_says_one_line_and_leaves_nothing(random_weights, tmp_path):

@@ -14,6 +14,7 @@ import pytest
 from mapfusion import ElementKind, GlobalMap, MapElement
 from mapfusion.formats.by_suffix import write_map
 from mapfusion.formats.local_plane import LocalPlane
+from tests.interrupts import heed_interrupts
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
 
@@ -53,11 +54,6 @@ def wait_until(condition, seconds: float = 90.0) -> bool:
             return True
         time.sleep(0.1)
     return False
-
-
-def heed_interrupts():
-    """Undo what a shell does to commands in the background: they would not hear Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def served(what: Path, port: int, *options: str) -> subprocess.Popen:
