@@ -134,7 +134,7 @@ def evaluate(
         official_frames=official_frames,
         rate=rate,
         results=results,
-        network=NetworkOptions(weights, device, precision, compiled),
+        network=NetworkOptions(weights, device, precision, compiled, ahead=jobs == 1),
         roi=_region(results, roi),
         protocol=stability,
         threads=threads,

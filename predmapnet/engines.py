@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from predmapnet.config import PredMapNetConfig
+from predmapnet.config import LookupBevConfig, PredMapNetConfig
 from predmapnet.machine import EngineKind, Precision
 from predmapnet.network.calibration import Calibration
 from predmapnet.network.kernels.compilation import compile_features
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.low_precision import in_precision
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, Selection, StreamState, ViewGeometry
+from predmapnet.network.state import (
+    BevFeatures,
+    FrameInputs,
+    ImageFeatures,
+    Selection,
+    StreamState,
+    ViewGeometry,
+)
 from predmapnet.network.track_selection import select
 
 CALIBRATIONS_KEPT = 8
@@ -37,8 +44,14 @@ class Engine(Protocol):
     config: PredMapNetConfig
     device: torch.device
 
-    def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
-        """Map one frame; a state of None begins a stream, and the one given is not changed."""
+    def features(self, inputs: FrameInputs) -> Any:
+        """Compute what a frame gives without memory; another thread may do that while a step runs."""
+
+    def step(self, inputs: FrameInputs, state: StreamState | None, features: Any = None) -> EngineStep:
+        """Map one frame; a state of None begins a stream, and the one given is not changed.
+
+        ``features`` are :meth:`features` of these inputs if they were computed ahead.
+        """
 
 
 class TorchEngine:
@@ -61,11 +74,24 @@ class TorchEngine:
             compile_features(self.network)
         self._geometries: dict[bytes, ViewGeometry] = {}
 
-    def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
+    def features(self, inputs: FrameInputs) -> ImageFeatures | BevFeatures:
+        """Compute image features, and BEV features where no BEV memory takes part in them."""
+        images = self.network.encode_images(inputs)
+        if not isinstance(self.config.bev, LookupBevConfig):
+            return images
+        return self.network.encode_bev(images, inputs, None, self._geometry(inputs.calibration))
+
+    def step(
+        self, inputs: FrameInputs, state: StreamState | None, features: ImageFeatures | BevFeatures | None = None
+    ) -> EngineStep:
         """Map one frame, as :class:`Engine` says."""
         if state is None:
             state = self.network.initial_state(1)
-        outputs = self.network(inputs, state, self._geometry(inputs.calibration))
+        if features is None:
+            features = self.features(inputs)
+        if isinstance(features, ImageFeatures):
+            features = self.network.encode_bev(features, inputs, state, self._geometry(inputs.calibration))
+        outputs = self.network.decode_bev(features, inputs, state)
         selection = select(outputs, state, self.config)
         state = self.network.advance(state, outputs, selection.instances, inputs, selection.lost)
         return selection, state, outputs.segmentation

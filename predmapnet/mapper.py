@@ -28,6 +28,15 @@ from predmapnet.weights.checkpoint import load_checkpoint
 
 
 @dataclass(frozen=True)
+class SeenFrame:
+    """A frame as far as it goes without memory: cameras with an image, inputs of the network, and features."""
+
+    valid: NDArray[np.bool_]
+    inputs: FrameInputs
+    features: Any
+
+
+@dataclass(frozen=True)
 class CameraImages:
     """Images of one instant as the network wants them: windows ``(N, h, w, 3)``, RGB, 0 to 255, in the rig's order.
 
@@ -56,6 +65,7 @@ class Mapper:
         precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.kernels.low_precision`).
         compiled: whether these two are compiled.
         engine: what computes the network.
+        ahead: whether :func:`predmapnet.mapping.map_scene` lets it :meth:`see` the next frame during a step.
     """
 
     def __init__(
@@ -66,6 +76,7 @@ class Mapper:
         facts: Mapping[str, Any] | None = None,
         precision: Precision = Precision.FLOAT32,
         compiled: bool = False,
+        ahead: bool = True,
     ) -> None:
         engine = TorchEngine(network, device, precision, compiled) if isinstance(network, PredMapNet) else network
         self.engine: Engine = engine
@@ -74,6 +85,7 @@ class Mapper:
         self.facts: Mapping[str, Any] = dict(facts or {})
         self.precision = precision
         self.compiled = compiled
+        self.ahead = ahead
 
     @classmethod
     def from_checkpoint(cls, options: NetworkOptions | None = None) -> Mapper:
@@ -83,11 +95,11 @@ class Mapper:
             from predmapnet.export.engine import OnnxEngine
 
             engine = OnnxEngine.open(options)
-            return cls(engine, engine.device, engine.graphs.sha256, engine.graphs.facts)
+            return cls(engine, engine.device, engine.graphs.sha256, engine.graphs.facts, ahead=options.ahead)
         checkpoint = load_checkpoint(options.weights)
         device = choose_device(options.device)
         facts, sha256 = checkpoint.facts, checkpoint.sha256
-        return cls(checkpoint.network, device, sha256, facts, options.precision, options.compiled)
+        return cls(checkpoint.network, device, sha256, facts, options.precision, options.compiled, options.ahead)
 
     @property
     def roi(self) -> RegionOfInterest:
@@ -121,12 +133,24 @@ class Mapper:
         return CameraImages(windows, valid)
 
     @torch.inference_mode()
+    def see(self, frame: Frame, images: CameraImages) -> SeenFrame:
+        """Compute what needs no memory of a frame; safe to call from another thread while a step runs."""
+        device = self.engine.device
+        inputs = FrameInputs(
+            images=normalise_images(torch.from_numpy(images.windows)[None].to(device), self.config.image),
+            camera_valid=torch.from_numpy(images.valid)[None].to(device),
+            ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(device),
+            calibration=calibrate(frame.rig, self.config).to(device),
+        )
+        return SeenFrame(images.valid, inputs, self.engine.features(inputs))
+
+    @torch.inference_mode()
     def step(
         self,
         frame: Frame,
         state: StreamState | None = None,
         *,
-        images: CameraImages | None = None,
+        images: CameraImages | SeenFrame | None = None,
         allow_missing_cameras: bool = False,
     ) -> tuple[FrameMap, StreamState]:
         """Map the next frame of a log.
@@ -134,7 +158,7 @@ class Mapper:
         Args:
             frame: the next of its log.
             state: returned by the step before; None begins a log.
-            images: of this frame, if :meth:`read_images` was called ahead; read here otherwise.
+            images: of this frame, if :meth:`read_images` or :meth:`see` was called ahead; read here otherwise.
             allow_missing_cameras: as in :meth:`read_images`, which also says what errors there are.
 
         Returns:
@@ -143,16 +167,10 @@ class Mapper:
         """
         if images is None:
             images = self.read_images(frame, allow_missing_cameras=allow_missing_cameras)
-        device = self.engine.device
-        inputs = FrameInputs(
-            images=normalise_images(torch.from_numpy(images.windows)[None].to(device), self.config.image),
-            camera_valid=torch.from_numpy(images.valid)[None].to(device),
-            ego_to_global=torch.from_numpy(np.asarray(frame.ego_to_global, dtype=np.float64))[None].to(device),
-            calibration=calibrate(frame.rig, self.config).to(device),
-        )
-        selection, state, segmentation = self.engine.step(inputs, state)
+        seen = images if isinstance(images, SeenFrame) else self.see(frame, images)
+        selection, state, segmentation = self.engine.step(seen.inputs, state, seen.features)
         frame_map = to_frame_map(selection, state, segmentation, self.config, frame.timestamp, frame.ego_to_global)
-        working = (camera for camera, valid in zip(frame.rig, images.valid, strict=True) if valid)
+        working = (camera for camera, valid in zip(frame.rig, seen.valid, strict=True) if valid)
         road = float(np.median([camera.ground_height for camera in frame.rig]))
         return replace(frame_map, visible=ground_in_view(working, self.roi), ground_height=road), state
 

@@ -1,4 +1,4 @@
-"""Walk through a scene frame by frame: read images ahead, map, integrate, and let observers watch."""
+"""Walk through a scene frame by frame: read ahead, map, integrate, and let observers watch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from predmapnet.machine import trim_memory
 from predmapnet.scenes import Frame, Scene
 
 if TYPE_CHECKING:  # What needs no network (runs.integrate) does not load torch.
-    from predmapnet.mapper import CameraImages, Mapper
+    from predmapnet.mapper import CameraImages, Mapper, SeenFrame
 
 NETWORK_ERRORS = IntegratorConfig(common_deviation=0.3)
 """Assumptions of the integrator about the networks of this package.
@@ -43,7 +43,8 @@ class Step:
     Attributes:
         frame: pose, calibration and images.
         frame_map: its map, rasters included.
-        milliseconds: by stage: ``images`` (waiting for them), ``network``, ``integration``.
+        milliseconds: by stage: ``images`` (waiting for them, or for what is computed of them ahead), ``network``,
+            ``integration``.
         fused: whether the integrator accepted the frame.
     """
 
@@ -149,13 +150,14 @@ def check_left_out(frames: int, fused: int, rejections: Mapping[str, int]) -> No
 def stream(
     scene: Scene, mapper: Mapper, integrator: MapIntegrator, allow_missing_cameras: bool = False
 ) -> Iterator[Step]:
-    """Map frame after frame, adding each to the integrator; images of the next one are read meanwhile."""
+    """Map frame after frame, adding each to the integrator; the next one is read, or even seen, meanwhile."""
     state = None
     with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as reader:
 
-        def read(index: int) -> tuple[Frame, CameraImages]:
+        def read(index: int) -> tuple[Frame, CameraImages | SeenFrame]:
             frame = scene.frame(index)
-            return frame, mapper.read_images(frame, allow_missing_cameras=allow_missing_cameras)
+            images = mapper.read_images(frame, allow_missing_cameras=allow_missing_cameras)
+            return frame, mapper.see(frame, images) if mapper.ahead else images
 
         upcoming = reader.submit(read, 0)
         for index in range(len(scene)):

@@ -60,20 +60,20 @@ class OnnxEngine:
                 export_graphs(load_checkpoint(options.weights), Path(folder) / "graphs"), torch.get_num_threads()
             )
 
-    def step(self, inputs: FrameInputs, state: StreamState | None) -> EngineStep:
+    def features(self, inputs: FrameInputs) -> Arrays | None:
+        """Compute BEV features where no BEV memory takes part in them; otherwise they are the step's."""
+        if any(name.startswith("state.") for name in self._image_inputs):
+            return None
+        return self._bev_levels(inputs, {})
+
+    def step(self, inputs: FrameInputs, state: StreamState | None, features: Arrays | None = None) -> EngineStep:
         """Map one frame, as :class:`~predmapnet.engines.Engine` says."""
         state = state or self._start
         tensors = {f"state.{name}": value.numpy() for name, value in state.tensors().items()}
         pose = inputs.ego_to_global.numpy()
-        given = {
-            "images": np.ascontiguousarray(inputs.images.numpy()),
-            "camera_valid": inputs.camera_valid.numpy(),
-            "camera_code": inputs.calibration.camera_code.numpy(),
-            "ego_to_global": pose,
-            **self._geometry(inputs),
-            **{f"state.{name}": tensors[f"state.{name}"] for name in BEV_MEMORY},
-        }
-        levels = _run(self._images, {name: value for name, value in given.items() if name in self._image_inputs})
+        levels = features
+        if levels is None:
+            levels = self._bev_levels(inputs, {f"state.{name}": tensors[f"state.{name}"] for name in BEV_MEMORY})
         named = {name: tensors[f"state.{name}"] for name in self._decoder.names}
         found = _run(
             self._map,
@@ -82,6 +82,18 @@ class OnnxEngine:
         outputs = {name: torch.from_numpy(value) for name, value in found.items()}
         following = self._decoder.state({name: outputs[f"next.{name}"] for name in self._decoder.names})
         return Selection(following.instances, _detections(outputs), following.lost), following, outputs["segmentation"]
+
+    def _bev_levels(self, inputs: FrameInputs, memory: Arrays) -> Arrays:
+        """Run the first graph on a frame and, where it takes part, the BEV memory."""
+        given = {
+            "images": np.ascontiguousarray(inputs.images.numpy()),
+            "camera_valid": inputs.camera_valid.numpy(),
+            "camera_code": inputs.calibration.camera_code.numpy(),
+            "ego_to_global": inputs.ego_to_global.numpy(),
+            **self._geometry(inputs),
+            **memory,
+        }
+        return _run(self._images, {name: value for name, value in given.items() if name in self._image_inputs})
 
     def _geometry(self, inputs: FrameInputs) -> Arrays:
         """Return the geometry of a calibration, from the few that were used last."""

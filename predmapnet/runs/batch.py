@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -174,7 +174,8 @@ class SceneWork:
         from predmapnet.runs.infer import MappingPipeline
         from predmapnet.sources import open_source
 
-        mapper = Mapper.from_checkpoint(settings.network)
+        # Workers share the cores by scenes: a second thread would only take turns with theirs.
+        mapper = Mapper.from_checkpoint(replace(settings.network, ahead=False))
         here = (predmapnet.__version__, mapper.weights_sha256)
         if here != (settings.version, settings.weights_sha256):
             raise UserError(

@@ -187,3 +187,20 @@ def test_an_unknown_device_is_refused():
 
     with pytest.raises(UserError, match="There is no device 'toaster'"):
         choose_device("toaster")
+
+
+def test_a_frame_that_was_seen_ahead_gives_the_same_and_only_the_rest_is_computed(mapper, logs):
+    expected, state, calls = [], None, []
+    absent = [replace(f, images={n: p for n, p in f.images.items() if n != "CAM_BACK"}) for f in logs["a"]]
+    for frame in absent:
+        frame_map, state = mapper.step(frame, state, allow_missing_cameras=True)
+        expected.append(frame_map)
+    seen = [mapper.see(frame, mapper.read_images(frame, allow_missing_cameras=True)) for frame in absent]
+    hook = mapper.engine.network.image_backbone.register_forward_hook(lambda *_: calls.append(1))
+    state = None
+    for frame, ahead, ours in zip(absent, seen, expected, strict=True):
+        frame_map, state = mapper.step(frame, state, images=ahead)
+        same(frame_map, ours)
+        assert np.array_equal(frame_map.visible[0], ours.visible[0])
+    hook.remove()
+    assert not calls
