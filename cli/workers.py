@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, redirect_stdout
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -68,10 +70,9 @@ def open_executor(
         from predmapnet.runs.ray_executor import RayExecutor
 
         cluster = RayExecutor(address, jobs, threads, device != "cpu", time_limit, say_warning)
-        try:
+        # What Ray prints of a death goes to the standard output, which belongs to results; the executor tells it.
+        with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), closing(cluster):
             yield cluster, cluster.place
-        finally:
-            cluster.close()
         return
     if jobs is None:
         jobs = workers_that_fit(device)

@@ -69,7 +69,8 @@ def write_report(
         UserError: the file cannot be written.
     """
     what = f"{context['dataset']}{', split ' + str(context['split']) if context['split'] else ''}"
-    counts = f"{len(measurement.scenes)} scenes, {len(measurement.frames)} frames"
+    several = "s" if len(measurement.scenes) != 1 else ""
+    counts = f"{len(measurement.scenes)} scene{several}, {len(measurement.frames)} frames"
     synthetic = " The demo world is synthetic." if context["synthetic"] else ""
     figures = measurement.figures()
     worst_first = sorted(per_scene, key=lambda name: _worth(per_scene[name]))

@@ -187,7 +187,8 @@ def _figures(
     if seconds:
         figures.append((f"{frames:,}", f"frames, {frames / seconds:.1f}/s per worker", False))
     if measured:
-        figures.append((f"{sum(measured) / len(measured):.3f}", f"mAP, mean of {len(measured)} scenes", False))
+        scenes = "1 scene" if len(measured) == 1 else f"{len(measured)} scenes"
+        figures.append((f"{sum(measured) / len(measured):.3f}", f"mAP, mean of {scenes}", False))
     figures.append((f"{doubts:,}", "doubtful stretches", False))
     return figures
 

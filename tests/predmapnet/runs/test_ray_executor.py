@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 
 import pytest
@@ -49,6 +50,24 @@ def test_actors_that_cannot_begin_end_the_run_with_their_error(executor):
 def test_actors_do_not_give_way_to_what_else_runs_here(executor):
     (end,) = executor.run(Niceness(), ["task"])
     assert end.result == os.nice(0)
+
+
+DYING = """
+import sys
+from pathlib import Path
+from cli.workers import WorkerKind, open_executor
+from tests.predmapnet.runs.work import Notebook
+with open_executor(WorkerKind.RAY, None, 1) as (executor, _):
+    ends = list(executor.run(Notebook(Path(sys.argv[1])), ["die", "square 3"]))
+print([end.result for end in ends if end.error is None])
+"""
+
+
+def test_what_ray_says_of_a_death_is_not_taken_for_a_result(tmp_path):
+    pytest.importorskip("ray")
+    ended = subprocess.run([sys.executable, "-c", DYING, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert ended.stdout.count("\n") == 1 and ended.stdout.startswith("[") and "9" in ended.stdout
+    assert "its worker died" in ended.stderr
 
 
 def test_without_the_extra_or_the_cluster_the_message_says_what_to_do(monkeypatch):
