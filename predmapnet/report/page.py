@@ -203,12 +203,16 @@ def _controls(places: Sequence[Place], truth: bool, doubts: bool) -> str:
     )
 
 
-def _doubt_list(doubts: Sequence[SheetDoubt], rows: Sequence[str]) -> str:
-    lines = "".join(
-        f'<li style="--kind:{web_colour(KIND_COLOURS[item.kind])}">{item.kind.noun.capitalize()}, '
-        f"{item.doubt.length:.0f} m: {escape('; '.join(item.doubt.reasons))}<span>{escape(rows[item.row])}</span></li>"
-        for item in doubts
+def _doubt_line(item: SheetDoubt, rows: Sequence[str]) -> str:
+    where = f"{item.doubt.length:.0f} m{' of its outline' if item.kind.is_ring else ''}"
+    return (
+        f'<li style="--kind:{web_colour(KIND_COLOURS[item.kind])}">{item.kind.noun.capitalize()}, {where}: '
+        f"{escape('; '.join(item.doubt.reasons))}<span>{escape(rows[item.row])}</span></li>"
     )
+
+
+def _doubt_list(doubts: Sequence[SheetDoubt], rows: Sequence[str]) -> str:
+    lines = "".join(_doubt_line(item, rows) for item in doubts)
     body = (
         f"<ol>{lines}</ol>" if lines else '<div class="empty">None: every stretch has evidence, and drives agree.</div>'
     )

@@ -64,9 +64,9 @@ class _Drawn:
 
     @property
     def totals(self) -> dict[str, tuple[int, float]]:
-        """Number and metres of the elements of each map."""
+        """Number and metres of the elements of each map; of crossings their longer sides, as everywhere."""
         return {
-            placed.name: (len(placed.global_map), sum(element.length for element in placed.global_map))
+            placed.name: (len(placed.global_map), sum(element.extent[0] for element in placed.global_map))
             for placed in self.maps
         }
 

@@ -142,18 +142,21 @@ def row_of(html: str, scene: str) -> dict[str, str]:
 
 def test_every_figure_of_a_scene_stands_under_its_heading(folder, tmp_path):
     doubtful = line(30.0, confidence=0.5, observations=2)
-    write_map(GlobalMap((line(), doubtful)), tmp_path / "scene-1.geojson", PLANE)
+    ring = np.array([[0, 40], [18, 40], [18, 44], [0, 44], [0, 40]], dtype=np.float64)
+    crossing = MapElement(ElementKind.PED_CROSSING, ring, 0.5, 9, 5_000, 6_000, (1,))
+    write_map(GlobalMap((line(), doubtful, crossing)), tmp_path / "scene-1.geojson", PLANE)
     write_failed(folder, Outcome("scene-1", "failed", 1.0, error="KeyError", reason="an earlier time"))
     html = folder_report(folder)
-    figures = {"frames": "40", "frames/s": "5.0", "elements": "2", "km": "0.20", "doubts": "1", "rejected": "2"}
+    figures = {"frames": "40", "frames/s": "5.0", "elements": "3", "km": "0.22", "doubts": "2", "rejected": "2"}
     figures |= {"mAP": "0.625", "precision": "0.900", "recall": "0.700", "why": "rejected 2 x jump", "status": "done"}
     assert row_of(html, "scene-1").items() >= figures.items()
     failed = row_of(html, "&lt;/script&gt;&lt;i&gt;")
     assert (failed["status"], failed["elements"], failed["frames"]) == ("failed", "–", "–")
     tiles = dict(re.findall(r"<b>([^<]*)</b><span>([^<]*)</span>", html))
-    assert tiles["1"] in ("scenes mapped", "scenes failed", "doubtful stretches")
+    assert tiles["1"] in ("scenes mapped", "scenes failed", "crossings")
     assert tiles["40"] == "frames, 5.0/s per worker"
     assert tiles["0.2 km"] == "dividers"
+    assert "Crossing, 44 m of its outline: " in html
 
 
 def test_names_and_places_of_any_letters_break_neither_links_nor_the_script(tmp_path):
