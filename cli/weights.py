@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -162,8 +163,7 @@ def _say_weights(info: WeightsInfo, names: bool) -> None:
     else:
         out.print("not written by PredMapNet", markup=False)
     facts = {"modules of the paper": info.modules or "none"} if info.modules is not None else {}
-    for name, value in (facts | dict(about.get("facts", {})) | {"sha256": info.sha256}).items():
-        out.print(f"{name.replace('_', ' ')}: {_said(value)}", markup=False, soft_wrap=True)
+    _say_facts(facts | dict(about.get("facts", {})) | {"sha256": info.sha256})
     table = Table("tensor" if names else "part", show_edge=False, pad_edge=False)
     if names:
         table.add_column("shape")
@@ -177,6 +177,17 @@ def _say_weights(info: WeightsInfo, names: bool) -> None:
     out.print(table)
     total = sum(tensor.count for tensor in info.tensors)
     out.print(f"{counted(len(info.tensors), 'tensor')}, {total:,} parameters, {info.size / 1e6:.1f} MB", markup=False)
+
+
+def _say_facts(facts: Mapping[str, Any], indent: str = "") -> None:
+    from cli.console import out
+
+    for name, value in facts.items():
+        nested = isinstance(value, Mapping)
+        said = "" if nested else f" {_said(value)}"
+        out.print(f"{indent}{name.replace('_', ' ')}:{said}", markup=False, soft_wrap=True)
+        if nested:
+            _say_facts(value, indent + "  ")
 
 
 def _said(value: Any) -> str:
