@@ -91,6 +91,8 @@ def _table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
         metadata = msgpack.unpackb((table.schema.metadata or {})[b"metadata"], strict_map_key=False)
         if not isinstance(metadata, dict):
             raise ValueError("its metadata are no dictionary")
+        if len(set(table.column_names)) < table.num_columns:
+            raise ValueError(f"it has a column twice: {', '.join(table.column_names)}")
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         raise UserError(f"{path} is no file of py123d, or damaged: {error}.") from error
     prefix = f"{path.stem}."
@@ -103,6 +105,15 @@ def _column(table: pa.Table, name: str, path: Path) -> list[Any]:
     return list(table[name].to_pylist())
 
 
+def _times(table: pa.Table, path: Path) -> list[int | None]:
+    """Return the times of the rows, nanoseconds; None where there is none."""
+    times = _column(table, "timestamp_us", path)
+    for time in times:
+        if time is not None and not (isinstance(time, int) and 0 <= time * MICROSECOND < 2**63):
+            raise UserError(f"{path}: '{time}' in the column 'timestamp_us' is no whole number of microseconds.")
+    return [None if time is None else time * MICROSECOND for time in times]
+
+
 def _pose(numbers: Any, where: str) -> Float:
     """Return a pose ``(4, 4)`` of x, y, z and the quaternion w, x, y, z."""
     numbers = numbers if isinstance(numbers, list) else []
@@ -112,17 +123,17 @@ def _pose(numbers: Any, where: str) -> Float:
 def _drive(path: Path) -> tuple[TimedPoses, float]:
     """Return the poses of the car, and how high its frame is above the road."""
     table, metadata = _table(path)
-    rows = dict(zip(_column(table, "timestamp_us", path), _column(table, "imu_se3", path), strict=True))
+    rows = dict(zip(_times(table, path), _column(table, "imu_se3", path), strict=True))
     rows.pop(None, None)
     if not rows:
         raise UserError(f"{path} holds no pose.")
     times = sorted(rows)
-    poses = np.array([_pose(rows[time], f"{path}, time {time} us") for time in times])
+    poses = np.array([_pose(rows[time], f"{path}, time {time} ns") for time in times])
     try:
         height = float(metadata["height"]) / 2 - float(metadata["center_to_imu_se3"][2])
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise UserError(f"{path}: its metadata do not tell the height of the car and its centre: {error}.") from error
-    return TimedPoses(np.array(times, dtype=np.int64) * MICROSECOND, poses), height
+    return TimedPoses(np.array(times, dtype=np.int64), poses), height
 
 
 def _entry(metadata: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -152,7 +163,7 @@ def _write_images(table: pa.Table, path: Path, folder: Path, root: Path | None, 
         except UserError:
             damaged += 1
             continue
-        (folder / f"{time * MICROSECOND}{ending}").write_bytes(content)
+        (folder / f"{time}{ending}").write_bytes(content)
         count += 1
     if damaged:
         notes.append(f"lost: {damaged} damaged images of {path.name}")
@@ -160,8 +171,8 @@ def _write_images(table: pa.Table, path: Path, folder: Path, root: Path | None, 
 
 
 def _images(table: pa.Table, path: Path, root: Path | None) -> Iterator[tuple[int, bytes]]:
-    """Yield time (microseconds) and content of each image: within the table, beside it, or in a video."""
-    times = _column(table, "timestamp_us", path)
+    """Yield time (nanoseconds) and content of each image: within the table, beside it, or in a video."""
+    times = _times(table, path)
     if "data" not in table.column_names:
         raise UserError(f"{path}: the column 'data' is missing.")
     video = cv2.VideoCapture(str(path.with_suffix(".mp4"))) if pa.types.is_integer(table["data"].type) else None
@@ -179,7 +190,9 @@ def _images(table: pa.Table, path: Path, root: Path | None) -> Iterator[tuple[in
             if encoded is None or not done:
                 raise UserError(f"{path.with_suffix('.mp4')} cannot be read, or ends before {path.name} does.")
             data = encoded.tobytes()
-        yield int(time), data
+        if not isinstance(data, bytes):
+            raise UserError(f"{path}: the column 'data' holds no images and no names of files.")
+        yield time, data
 
 
 def _file(root: Path, name: str) -> bytes:

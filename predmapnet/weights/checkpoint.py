@@ -86,22 +86,27 @@ def load_checkpoint(path: Path | None = None) -> Checkpoint:
     try:
         with safe_open(path, framework="pt") as file:
             about = description(file.metadata())
+            config, facts = _described(about, path)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise unreadable(path, error) from None
+    network = _fitting_network(config, tensors, path)
+    network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
+    network.eval()
+    return Checkpoint(network, facts, str(about.get("version")), weights_hash(path))
+
+
+def _described(about: Mapping[str, Any], path: Path) -> tuple[PredMapNetConfig, Mapping[str, Any]]:
+    """Return the configuration and the facts of a description; raises UserError if it is of another format."""
     if about.get("format") != FORMAT:
         raise UserError(
             f"{path} does not hold PredMapNet weights of format {FORMAT} (it says: {about.get('format')}). "
             "Weights of other programs have to be imported first."
         )
-    config = parse_config(json.dumps(about.get("configuration")), str(path))
     facts = about.get("facts")
     if not isinstance(facts, dict):
         raise UserError(f"{path}: its description has no object 'facts', but {str(facts)[:40]}.")
-    network = _fitting_network(config, tensors, path)
-    network.load_state_dict({name: _full(tensor) for name, tensor in tensors.items()})
-    network.eval()
-    return Checkpoint(network, facts, str(about.get("version")), weights_hash(path))
+    return parse_config(json.dumps(about.get("configuration")), str(path)), facts
 
 
 def _full(tensor: torch.Tensor) -> torch.Tensor:

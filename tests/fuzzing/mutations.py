@@ -13,10 +13,13 @@ from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
+import msgpack
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pyarrow import feather
+
+from tests.fuzzing.stored_messages import mcap_mutated, sqlite_mutated
 
 Mutation = Callable[[bytes, random.Random], bytes]
 
@@ -159,19 +162,32 @@ def arrow_mutated(content: bytes, generator: random.Random) -> bytes:
         elif action == 2:
             table = table.rename_columns([generator.choice(["", "x", other]) for other in table.column_names])
         elif action == 3:
-            metadata = {key: bytes_mutated(value, generator) for key, value in (table.schema.metadata or {}).items()}
+            metadata = {
+                key: _metadata_mutated(value, generator) for key, value in (table.schema.metadata or {}).items()
+            }
             table = table.replace_schema_metadata(metadata)
         elif action == 4:
             table = generator.choice([table.slice(0, 0), table.slice(1), pa.concat_tables([table] * 3)])
         else:
-            changed = _column_mutated(column, generator)
-            table = table.set_column(at, name, changed)
+            table = table.set_column(at, name, _column_mutated(column, generator))
     buffer = io.BytesIO()
     if parquet:
         pq.write_table(table, buffer, compression=generator.choice(["zstd", "snappy", "none"]))
     else:
         feather.write_feather(table, buffer, compression=generator.choice(["lz4", "zstd", "uncompressed"]))
     return buffer.getvalue()
+
+
+def _metadata_mutated(content: bytes, generator: random.Random) -> bytes:
+    """Return metadata (JSON, another text, or py123d's MessagePack) with members or bytes changed."""
+    if content[:1] < b"\x80" or generator.random() < 0.2:
+        return bytes_mutated(content, generator)
+    text = json.dumps(msgpack.unpackb(content)).encode()
+    changed = json_mutated(text, generator)
+    try:
+        return bytes(msgpack.packb(json.loads(changed)))
+    except (ValueError, OverflowError, RecursionError, UnicodeEncodeError):
+        return changed
 
 
 def _column_mutated(column: pa.ChunkedArray, generator: random.Random) -> pa.ChunkedArray | pa.Array:
@@ -243,8 +259,13 @@ def _jpeg_mutated(content: bytearray, generator: random.Random) -> bytes:
 
 
 def safetensors_mutated(content: bytes, generator: random.Random) -> bytes:
-    """Return a safetensors file with another header: names, shapes, kinds, offsets, or our own metadata."""
+    """Return a safetensors file with another header: names, shapes, kinds, offsets, or our own metadata.
+
+    Bytes of the header are changed, too: those of its numbers are of less interest.
+    """
     (length,) = struct.unpack("<Q", content[:8])
+    if generator.random() < 0.35:
+        return bytes_mutated(content[: 8 + length], generator) + content[8 + length :]
     header, rest = json.loads(content[8 : 8 + length]), content[8 + length :]
     if "__metadata__" in header and generator.random() < 0.7:
         name, text = next(iter(header["__metadata__"].items()))
@@ -308,6 +329,10 @@ STRUCTURED: dict[str, Mutation] = {
     ".txt": rows_mutated,
     ".tum": rows_mutated,
     ".feather": arrow_mutated,
+    ".arrow": arrow_mutated,
+    ".mcap": mcap_mutated,
+    ".db3": sqlite_mutated,
+    ".gpkg": sqlite_mutated,
     ".parquet": arrow_mutated,
     ".jpg": image_mutated,
     ".png": image_mutated,
@@ -324,6 +349,7 @@ def mutated(ending: str, content: bytes, others: list[bytes], generator: random.
     if chosen < 0.02:
         return generator.choice([b"", b"\0" * 1000, b"\xef\xbb\xbf", *others])
     structured = STRUCTURED.get(ending)
-    if structured is None or chosen < 0.35 or (structured is zip_mutated and content[:2] != b"PK"):
+    plain = 0.05 if structured is safetensors_mutated else 0.35
+    if structured is None or chosen < plain or (structured is zip_mutated and content[:2] != b"PK"):
         return bytes_mutated(content, generator)
     return structured(content, generator)

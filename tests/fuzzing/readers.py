@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -49,6 +48,7 @@ from predmapnet.weights.imagenet_import import is_imagenet_backbone
 from predmapnet.weights.inspection import inspect_file
 from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint
 from tests.fuzzing import examples
+from tests.fuzzing.recordings import RECORDINGS
 from tests.predmapnet.small_networks import small_config
 from tests.predmapnet.training.painted_scenes import painted_scene, tiny_config
 
@@ -153,13 +153,18 @@ def _read_results(folder: Path, changed: Path) -> None:
     _integrated(changed, folder / "poses.json")
 
 
-@cache
-def _network() -> PredMapNet:
-    return PredMapNet(small_config("lite"))
-
-
 def _write_weights(folder: Path) -> list[Path]:
-    save_checkpoint(folder / "weights.safetensors", _network(), {"frames": 3})
+    off = {"enabled": False}
+    config = small_config(
+        "lite",
+        bev={"backbone": {"stem": (4, 4), "widths": (4, 4, 4), "channels": 4}, "widths": (4, 4, 4), "memory": off},
+        decoder={"width": 8, "heads": 2, "layers": 1, "point_width": 4, "queries": 4},
+        semantic_queries=off,
+        history_map={"memory": False, "guidance": False},
+        future=off,
+        revival=off,
+    )
+    save_checkpoint(folder / "weights.safetensors", PredMapNet(config), {"frames": 3})
     return [folder / "weights.safetensors"]
 
 
@@ -185,11 +190,16 @@ def _read_foreign(folder: Path, changed: Path) -> None:
         import_maptracker(official, small_config())
 
 
+def _layers() -> torch.nn.Module:
+    """Return layers in place of the network, of which checkpoints of a run know the tensors alone."""
+    return torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+
+
 def _write_run(folder: Path) -> list[Path]:
     position = run_checkpoint.Position("single", 3, [5, 9], 12, best={"single": 0.4}, finished=["single"])
     partial = run_checkpoint.partial_folder(folder, position)
     partial.mkdir()
-    network = _network()
+    network = _layers()
     optimiser = make_optimiser(network, OptimiserSettings())
     for parameter in network.parameters():
         parameter.grad = torch.zeros_like(parameter)
@@ -206,7 +216,7 @@ def _read_run(folder: Path, changed: Path) -> None:
     position = run_checkpoint.read_position(newest)
     assert position.step >= 0 and position.seconds >= 0 and "single" in [*position.finished, *position.best, "single"]
     tensors = run_checkpoint.read_tensors(newest, "network")
-    network = _network()
+    network = _layers()
     load_weights(network, run_checkpoint.below_prefix("network", tensors), newest)
     optimiser = make_optimiser(network, OptimiserSettings())
     own = run_checkpoint.read_tensors(newest, "rank-0")
@@ -310,6 +320,7 @@ READERS = {
         Reader("evaluations", examples.write_evaluations,
                lambda at, _: compare_evaluations([at / "one.json", at / "two.json"]) and None),
         Reader("caches", _write_caches, _read_caches),
+        *(Reader(name, write, read) for name, (write, read) in RECORDINGS.items()),
         *(Reader(f"map{suffix}", _write_maps(suffix), _read_map, BESIDE) for suffix in SUFFIXES),
     )
 }  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -36,9 +37,7 @@ class Reader:
     """
 
     def __init__(self) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._store = _standard_types()
         self.damaged: Counter[str] = Counter()
 
     def message(self, recorded: Recorded) -> Any | None:
@@ -50,6 +49,13 @@ class Reader:
         except SerdeError:
             self.damaged[recorded.topic] += 1
             return None
+
+
+@cache
+def _standard_types() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 @dataclass

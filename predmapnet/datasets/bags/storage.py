@@ -81,13 +81,18 @@ class Bag:
         for file in self.files:
             size = file.stat().st_size
             read = _mcap_messages if ".mcap" in file.suffixes else _sqlite_messages
-            contents = 0
+            contents, timeless = 0, 0
             with _opened(file) as stream:
                 for message in read(self, file, stream, kinds):
+                    if not 0 <= message.received < 2**63:
+                        timeless += 1
+                        continue
                     self.counts[message.topic] += 1
                     contents += len(message.data)
                     progress(before + min(max(contents, stream.tell()), size), total)
                     yield message._replace(data=_plain(message.data))
+            if timeless:
+                self.damage.append(f"{file.name}: {timeless} messages of a time that no clock has are lost")
             before += size
             progress(before, total)
 
@@ -179,6 +184,8 @@ def _sqlite_messages(bag: Bag, file: Path, stream: IO[bytes], kinds: Collection[
             # Else SQLite opens no file that is shorter than it was.
             database.execute("PRAGMA writable_schema = ON")
             rows = database.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
+            if unnamed := [row for row, *names in rows if not all(isinstance(name, str) for name in names)]:
+                raise ValueError(f"topic {unnamed[0]} has no name, type or format")
             topics = {row: (name, kind if form == "cdr" else f"{kind} as {form}") for row, name, kind, form in rows}
             bag.topics |= dict(topics.values())
             wanted = [row for row, (_, kind) in topics.items() if kind in kinds]
@@ -187,5 +194,5 @@ def _sqlite_messages(bag: Bag, file: Path, stream: IO[bytes], kinds: Collection[
             for topic, received, data in database.execute(query, wanted):
                 count += 1
                 yield Recorded(*topics[topic], int(received), bytes(data))
-        except (sqlite3.DatabaseError, TypeError, ValueError) as error:
+        except (sqlite3.DatabaseError, TypeError, ValueError, OverflowError) as error:
             bag.damage.append(f"{file.name} is damaged ({error}): {count} messages could be read, the rest is lost")

@@ -8,14 +8,13 @@ import msgpack
 import numpy as np
 import pyarrow as pa
 import pytest
-from scipy.spatial.transform import Rotation
 
-from predmapnet.datasets.own_logs.pose_files import read_timed_poses
 from predmapnet.datasets.own_logs.scene import LogScene
 from predmapnet.datasets.py123d_logs import log_from_py123d
 from predmapnet.errors import UserError
 from tests.environments import PY123D, printed_json, python_with
-from tests.predmapnet.datasets.own_logs.drawn_log import ABOVE_ROAD, bend, entry, write_log
+from tests.predmapnet.datasets.drawn_recordings import numbers_of, write_py123d
+from tests.predmapnet.datasets.own_logs.drawn_log import bend, entry, write_log
 
 CAMERAS = {
     "pcam_f0": entry(0, 160, 96, 90.0),
@@ -28,63 +27,9 @@ def log(tmp_path_factory):
     return write_log(tmp_path_factory.mktemp("logs") / "drive", CAMERAS, bend(12), late=20_000_000)
 
 
-def numbers_of(log: Path) -> dict:
-    """The log as numbers: see ``write_py123d_log.py``."""
-    poses = read_timed_poses(log)
-    rows = []
-    for time, pose in zip(poses.timestamps.tolist(), poses.ego_to_global, strict=True):
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        rows.append([time // 1000, *pose[:3, 3].tolist(), w, x, y, z])
-    cameras = {}
-    for name, camera in CAMERAS.items():
-        mounting = camera["camera_to_ego"]
-        cameras[name] = {
-            "width": camera["width"],
-            "height": camera["height"],
-            "intrinsics": [*camera["intrinsics"].values(), 0.0],
-            "distortion": camera.get("distortion"),
-            "pose": [*mounting["translation_m"], *mounting["rotation_wxyz"]],
-            "images": [[int(p.stem) // 1000, str(p)] for p in sorted((log / "images" / name).iterdir())],
-        }
-    return {"height": ABOVE_ROAD, "poses": rows, "cameras": cameras}
-
-
-def write_table(folder: Path, key: str, columns: dict, metadata: dict) -> None:
-    """A file of a modality, laid out as py123d 0.7.0 does."""
-    table = pa.table({f"{key}.{name}": column for name, column in columns.items()})
-    with pa.ipc.new_file(
-        str(folder / f"{key}.arrow"), table.schema.with_metadata({"metadata": msgpack.packb(metadata)})
-    ) as file:
-        file.write_table(table)
-
-
 @pytest.fixture
 def folder(log, tmp_path):
     return write_py123d(log, tmp_path / "py123d")
-
-
-def write_py123d(log: Path, folder: Path, codec: str = "jpeg_binary") -> Path:
-    folder.mkdir()
-    numbers = numbers_of(log)
-    times, poses = [row[0] for row in numbers["poses"]], [row[1:] for row in numbers["poses"]]
-    size = {"height": 1.8, "center_to_imu_se3": [1.4, 0.0, 0.9 - numbers["height"], 1.0, 0.0, 0.0, 0.0]}
-    write_table(folder, "ego_state_se3", {"timestamp_us": pa.array(times, pa.int64()), "imu_se3": poses}, size)
-    for name, camera in numbers["cameras"].items():
-        times, paths = zip(*camera["images"], strict=True)
-        data = [Path(path).read_bytes() if codec == "jpeg_binary" else Path(path).name for path in paths]
-        if codec == "mp4":
-            video = cv2.VideoWriter(
-                str(folder / f"camera.{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, (160, 96)
-            )
-            for path in paths:
-                video.write(cv2.imread(path))
-            video.release()
-            data = pa.array(range(len(paths)), pa.int32())
-        metadata = {"camera_model": "pinhole", "camera_to_imu_se3": camera["pose"], "is_undistorted": False}
-        metadata |= {key: camera[key] for key in ("width", "height", "intrinsics", "distortion")}
-        columns = {"timestamp_us": pa.array(times, pa.int64()), "data": data}
-        write_table(folder, f"camera.{name}", columns, metadata)
-    return folder
 
 
 def assert_same(found: Path, log: Path, images: bool = True) -> None:
