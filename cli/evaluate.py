@@ -190,7 +190,7 @@ def _region(results: Path | None, stated: Region | None) -> RegionOfInterest:
 
     if results is not None and not results.exists():
         raise UserError(f"There is no file or folder {results}.")
-    submission = results is not None and results.is_file() and results.suffix == ".json"
+    submission = results is not None and results.is_file() and results.suffix.lower() == ".json"
     if stated is not None and not submission:
         raise UserError("--roi is for submissions (.json); what is mapped here and our own files know their region.")
     if results is None or not submission:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -75,7 +76,7 @@ def view(
         raise UserError("--json tells what was written: it needs --out")
     if out is not None:
         check_output(out, (".rrd",), [Path(one) for one in what])
-    name = Path(what[0]).resolve().stem
+    name = Path(os.path.realpath(what[0])).stem
     if what[0].lower().endswith(".rrd") and len(what) == 1:
         if out is not None:
             raise UserError(f"{what[0]} is a recording already: leave out --out")

@@ -20,8 +20,7 @@ def write_whole(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the file cannot be written, or another program has it open.
     """
-    if path.is_symlink():  # the link stays one, and the file that it names is written
-        path = path.resolve()
+    path = target_of(path)
     _refuse_open_file(path)
     temporary = path.with_name(f".{secrets.token_hex(4)}.part{path.suffix}")
     try:
@@ -32,6 +31,18 @@ def write_whole(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def target_of(path: Path) -> Path:
+    """Return the path, or the file that it names if it is a link: links stay where they are.
+
+    Raises:
+        OSError: links that lead in a circle.
+    """
+    found = Path(os.path.realpath(path)) if path.is_symlink() else path
+    if found.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    return found
 
 
 def companion_of_open_file(path: Path) -> Path | None:

@@ -40,7 +40,7 @@ def check_output(path: Path, endings: tuple[str, ...] = (), inputs: Sequence[Pat
         raise UserError(f"cannot write {path.name}: {folder} is a file, not a folder")
     if path.exists():
         _check_loss(path, inputs, force)
-    companion = mapfusion.files.companion_of_open_file(path.resolve() if path.is_symlink() else path)
+    companion = mapfusion.files.companion_of_open_file(mapfusion.files.target_of(path))
     if companion is not None:
         raise UserError(
             f"cannot write {path}: another program (QGIS, for example) has it open, since {companion} is there. Close "
@@ -75,7 +75,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
     Raises:
         UserError: ``path`` exists already, or cannot be written.
     """
-    if path.exists():
+    if path.exists() or path.is_symlink():
         raise UserError(f"{path} exists already. Choose another name, or delete it first.")
     with write_errors_told(path):
         path.absolute().parent.mkdir(parents=True, exist_ok=True)

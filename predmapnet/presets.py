@@ -123,7 +123,7 @@ def _place(location: tuple[int | str, ...]) -> str:
 def load_config(name_or_path: str | Path) -> PredMapNetConfig:
     """Return a preset by name, or read a ``.json`` file; raises UserError where there is none, or it does not fit."""
     path = Path(name_or_path)
-    if path.suffix != ".json":
+    if path.suffix.lower() != ".json":
         return preset(str(name_or_path))
     if not path.is_file():
         raise UserError(f"there is no configuration file {path}")

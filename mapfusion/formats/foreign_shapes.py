@@ -82,12 +82,16 @@ def _parts(geometry: Any, feature: int, notes: ReadingNotes) -> Iterator[tuple[s
         raise ValueError(f"its geometry is not an object but {str(geometry)[:40]!r}")
     name, coordinates = geometry.get("type"), geometry.get("coordinates")
     if name == "GeometryCollection":
-        for part in geometry.get("geometries") or ():
+        coordinates = geometry.get("geometries")
+    if str(name).startswith(("Geometry", "Multi")) and not coordinates:
+        notes.add("an empty geometry: left out", feature)
+    elif name == "GeometryCollection":
+        for part in coordinates:
             yield from _parts(part, feature, notes)
     elif name in ("LineString", "Polygon"):
         yield name, coordinates
     elif name in ("MultiLineString", "MultiPolygon"):
-        for part in coordinates or ():
+        for part in coordinates:
             yield name.removeprefix("Multi"), part
     elif name in ("Point", "MultiPoint"):
         notes.add("a point, which is no element of a map: left out", feature)

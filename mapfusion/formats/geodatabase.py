@@ -36,6 +36,8 @@ from mapfusion.ground import ground_within
 LINES, CROSSINGS, OBSERVED = "lines", "crossings", "observed"
 LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")
 TIMES, REST = ("first_seen", "last_seen"), "_rest_ns"
+SPECIAL = re.compile(r"[!;?\x00-\x1f\ud800-\udfff]|^\w\w+:")
+"""What pyogrio cuts names at, GDAL drops from them, UTF-8 does not have, or names a driver in place of a file."""
 FLAT = "FlatGeobuf"
 """Driver whose layers of lines and areas together have no heights."""
 METADATA = "predmapnet"
@@ -66,7 +68,7 @@ def write_geodatabase(
     with write_sealed(path) as temporary, _plain_folder(temporary) as plain:
         try:
             if path.suffix.lower() == ".fgb":
-                _write_layer(plain, FLAT, path.stem, "Unknown", rows, origin, system)
+                _write_layer(plain, FLAT, path.stem.encode(errors="replace").decode(), "Unknown", rows, origin, system)
                 return
             crossings = [row for row in rows if row[1]["geometry"]["type"] == "Polygon"]
             lines = [row for row in rows if row[1]["geometry"]["type"] == "LineString"]
@@ -195,7 +197,7 @@ def _heights_text(geometry: Mapping[str, Any]) -> str | None:
 @contextmanager
 def _plain_folder(path: Path) -> Iterator[Path]:
     """Yield a path to a file that is yet to be written, as :func:`plain_path` does for one that is there."""
-    if not re.search(r"[!;?]", str(path)):
+    if not SPECIAL.search(str(path)):
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ import shapely.geometry
 from mapfusion.elements import GlobalMap
 from mapfusion.formats.features import Feature, map_of
 from mapfusion.formats.foreign_values import json_of, number_of
-from mapfusion.formats.geodatabase import METADATA, OBSERVED, REST, TIMES
+from mapfusion.formats.geodatabase import METADATA, OBSERVED, REST, SPECIAL, TIMES
 from mapfusion.formats.reading_notes import ReadingNotes
 from mapfusion.formats.reference_systems import ToDegrees
 from mapfusion.georeference import InvertibleGeoreference
@@ -164,8 +163,8 @@ def driver_errors_told(path: Path) -> Iterator[None]:
 
 @contextmanager
 def plain_path(path: Path) -> Iterator[Path]:
-    """Yield a path to the same file that pyogrio takes as it is: it cuts names at ``!``, ``;`` and ``?``."""
-    if not re.search(r"[!;?]|\.zip$", str(path)):
+    """Yield a path to the same file that GDAL takes as it is; see :data:`SPECIAL`."""
+    if not SPECIAL.search(str(path)) and path.suffix != ".zip":
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:

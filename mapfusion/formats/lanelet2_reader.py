@@ -49,16 +49,24 @@ def read_lanelet(path: Path, georeference: InvertibleGeoreference | None = None)
     return map_of((Feature(feature, to_degrees) for feature in features), origin, path, georeference, notes)
 
 
+def _by_id(root: ElementTree.Element, name: str) -> dict[str | None, ElementTree.Element]:
+    """Return the nodes, ways or relations of a file by id; raises ValueError where two have the same."""
+    found: dict[str | None, ElementTree.Element] = {}
+    for each in root.iter(name):
+        number = each.attrib.get("id")
+        if number in found:
+            raise ValueError(f"the {name} {number} is there twice")
+        found[number] = each
+    return found
+
+
 class _Document:
     """Nodes, ways and relations of a file by id."""
 
     def __init__(self, root: ElementTree.Element, local: bool, notes: ReadingNotes) -> None:
         self._local, self._notes = local, notes
-        self._nodes = {node.attrib.get("id"): node for node in root.iter("node")}
-        self._ways = {way.attrib.get("id"): way for way in root.iter("way")}
-        self._relations = [
-            relation for relation in root.iter("relation") if _tags(relation).get("subtype") == "crosswalk"
-        ]
+        self._nodes, self._ways, relations = (_by_id(root, name) for name in ("node", "way", "relation"))
+        self._relations = [each for each in relations.values() if _tags(each).get("subtype") == "crosswalk"]
         if any(map(_deleted, [*self._ways.values(), *self._relations])):
             notes.add("ways and lanelets that are marked as deleted are left out")
 

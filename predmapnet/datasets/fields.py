@@ -62,6 +62,11 @@ def _wrong(record: Mapping[str, Any], name: str, expected: str, where: str) -> U
     return UserError(f"{where}{which}: the field '{name}' {found}; {expected} is expected.")
 
 
+def is_given(path: Path) -> bool:
+    """Whether something has the name of a file that need not be there: a folder or a broken link is no lack of it."""
+    return path.exists() or path.is_symlink()
+
+
 def is_there(path: Path) -> bool:
     """Whether a file that a table names exists; a name that no disk can hold is that of none."""
     try:

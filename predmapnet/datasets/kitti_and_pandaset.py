@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import shutil
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -51,14 +51,17 @@ def log_from_kitti(drive: Path, out: Path) -> MadeLog:
     Raises:
         UserError: ``out`` is there already, or the drive lacks something, is damaged, or is not rectified.
     """
-    if drive.resolve().name.endswith("_extract"):
+    folder = Path(os.path.realpath(drive))
+    if folder.name.endswith("_extract"):
         raise UserError(f"{drive} holds images that are not rectified. Take the drive that ends with _sync.")
     name, *others = [name for name in KITTI_CAMERAS if (drive / name / "data").is_dir()] or KITTI_CAMERAS[:1]
     images = _kitti_files(drive / name, ".png")
-    camera = _kitti_camera(drive.resolve().parent, name, next(iter(images.values())))
+    camera = _kitti_camera(folder.parent, name, next(iter(images.values())))
     packets = _kitti_files(drive / "oxts", ".txt")
     # Latitude and longitude, degrees, altitude, metres, roll, pitch and yaw (0 is east), radians.
-    rows = np.array([_numbers({p.name: _content(p).split()[:6]}, p.name, (6,), p) for p in packets.values()])
+    first = "first words"
+    words = {path: _content(path).decode(errors="replace").split()[:6] for path in packets.values()}
+    rows = np.array([_numbers({first: six}, first, (6,), path) for path, six in words.items()])
     plane = plane_at(float(rows[0, 0]), float(rows[0, 1]), "first pose", str(next(iter(packets.values()))))
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     try:
@@ -115,11 +118,16 @@ def _write(
 ) -> MadeLog:
     """Write the folder of a log; raises UserError, naming ``source``, if no log came of it."""
     rig, poses, images = log
+    counts: dict[str, int] = {}
     with whole_folder(out) as draft:
         for name, files in images.items():
             (draft / "images" / name).mkdir(parents=True)
-            for time, path in files.items():
-                shutil.copyfile(path, draft / "images" / name / f"{time}{path.suffix}")
+            damaged = sum(
+                not _copied(path, draft / "images" / name / f"{time}{path.suffix}") for time, path in files.items()
+            )
+            counts[name] = len(files) - damaged
+            if damaged:
+                notes.append(f"lost: {damaged} damaged images of {name}")
         write_rig(draft / CALIBRATION, rig)
         write_timed_poses(draft / POSE_FILES[0], poses)
         if plane is not None:
@@ -127,7 +135,18 @@ def _write(
             (draft / "georeference.json").write_text(json.dumps(place))
         check_made_log(draft, out, source)
     folders = {name: str(next(iter(files.values())).parent) for name, files in images.items()}
-    return MadeLog(folders, {name: len(files) for name, files in images.items()}, count_and_rate(poses), notes, out)
+    return MadeLog(folders, counts, count_and_rate(poses), notes, out)
+
+
+def _copied(image: Path, to: Path) -> bool:
+    """Copy an image, and return whether it is a whole one; others are left out."""
+    content = _content(image)
+    try:
+        stored_size(content, str(image))
+    except UserError:
+        return False
+    to.write_bytes(content)
+    return True
 
 
 def _content(path: Path) -> bytes:

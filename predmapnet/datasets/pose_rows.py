@@ -56,7 +56,8 @@ def csv_pose_rows(path: Path, how: str) -> list[tuple[str, Mapping[str, Any]]]:
             else:
                 values["rotation"] = [float(values[name]) for name in ("qw", "qx", "qy", "qz")]
         except KeyError as error:
-            raise UserError(f"{path}, line {line}: {error} is missing. {how}.") from error
+            known = f"; the columns are: {', '.join(names)[:80]}" if error.args[0] not in names else ""
+            raise UserError(f"{path}, line {line}: {error} is missing{known}. {how}.") from error
         except (TypeError, ValueError) as error:
             raise UserError(f"{path}, line {line}: {error}.") from error
         result.append((f"line {line}", values))

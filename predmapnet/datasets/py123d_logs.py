@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -196,8 +197,8 @@ def _images(table: pa.Table, path: Path, root: Path | None) -> Iterator[tuple[in
 
 
 def _file(root: Path, name: str) -> bytes:
-    path = (root / name).resolve()
-    if not path.is_relative_to(root.resolve()):
+    path = Path(os.path.realpath(root / name))
+    if not path.is_relative_to(os.path.realpath(root)):
         raise UserError(f"The image {name} would lie outside of {root}.")
     return path.read_bytes()
 

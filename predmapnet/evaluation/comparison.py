@@ -6,6 +6,7 @@ the first method, holds 95 % of the draws. A difference whose interval holds 0 i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,8 +124,8 @@ def compare_evaluations(paths: Sequence[Path], seed: int = 0) -> Comparison:
     """
     if len(paths) < 2:
         raise UserError("A comparison needs at least two files of 'predmapnet evaluate --json'.")
-    names = [path.resolve() for path in paths]
-    twice = next((path for path in paths if names.count(path.resolve()) > 1), None)
+    names = [os.path.realpath(path) for path in paths]
+    twice = next((path for path, name in zip(paths, names, strict=True) if names.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"{twice} is given twice.")
     evaluations = [_read(path) for path in paths]

@@ -166,7 +166,7 @@ def refuse_pickle(path: Path) -> None:
     """Raise UserError if ``path`` looks like a pickle by its name or its first bytes."""
     with path.open("rb") as file:
         start = file.read(2)
-    if path.suffix in (".pkl", ".pickle") or (start[:1] == b"\x80" and start[1:2] <= b"\x05"):
+    if path.suffix.lower() in (".pkl", ".pickle") or (start[:1] == b"\x80" and start[1:2] <= b"\x05"):
         raise UserError(
             f"{path} is a Python pickle. Pickles can run any code when they are read, so they are refused: "
             "convert it to a submission JSON or to per-frame Parquet first."

@@ -211,7 +211,7 @@ def _read_submission(path: Path, changed: int) -> _Submission:
 
 def notes_of(settings: EvaluationSettings, source: SceneSource) -> list[str]:
     """Return what of a submission is not measured: elements of other classes, and frames that the data set lacks."""
-    if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
+    if settings.results is None or settings.results.is_dir() or settings.results.suffix.lower() != ".json":
         return []
     submission = _submission(settings.results)
     lost = len(submission.frames) - len(_scene_by_name(submission.frames, source))
@@ -221,7 +221,7 @@ def notes_of(settings: EvaluationSettings, source: SceneSource) -> list[str]:
 
 def _submitted_of(settings: EvaluationSettings, scenes: Sequence[str]) -> dict[str, Submitted]:
     """Frames of a submission by scene: it is read once, each process gets its share. Empty for our own files."""
-    if settings.results is None or settings.results.is_dir() or settings.results.suffix != ".json":
+    if settings.results is None or settings.results.is_dir() or settings.results.suffix.lower() != ".json":
         return {}
     submission = _submission(settings.results).frames
     of_scene: dict[str, Submitted] = {scene: {} for scene in scenes}
@@ -255,7 +255,7 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
                     f"{results / name}.parquet holds frames of {others[0]}, too; a file has one scene here."
                 )
         return names
-    if results.suffix == ".json":
+    if results.suffix.lower() == ".json":
         submission = _submission(results).frames
         scenes = _scene_by_name(submission, source)
         unknown = [name for name in submission if name not in scenes]
@@ -270,7 +270,7 @@ def _scenes_in(results: Path, source: SceneSource, every_frame: bool) -> set[str
                 f"{example}. Name another data set, or a --split to measure only that.{hint}"
             )
         return set(scenes.values())
-    if results.suffix != ".parquet":
+    if results.suffix.lower() != ".parquet":
         refuse_pickle(results)
         raise UserError(f"{results} holds no per-frame results: .parquet, .json or a folder is expected.")
     return set(stored_scenes(results))

@@ -59,7 +59,7 @@ def description(metadata: Mapping[str, str] | None) -> dict[str, Any]:
 
 def unreadable(path: Path, error: Exception) -> UserError:
     """Return the error for a file that safetensors cannot read."""
-    if path.suffix in {".pth", ".pt", ".ckpt"}:
+    if path.suffix.lower() in {".pth", ".pt", ".ckpt"}:
         return UserError(
             f"{path} is a PyTorch checkpoint, which has to be imported first: "
             f"predmapnet weights import {path} --out weights.safetensors"

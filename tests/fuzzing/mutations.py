@@ -182,8 +182,11 @@ def _metadata_mutated(content: bytes, generator: random.Random) -> bytes:
     """Return metadata (JSON, another text, or py123d's MessagePack) with members or bytes changed."""
     if content[:1] < b"\x80" or generator.random() < 0.2:
         return bytes_mutated(content, generator)
-    text = json.dumps(msgpack.unpackb(content)).encode()
-    changed = json_mutated(text, generator)
+    try:
+        document = json.dumps(msgpack.unpackb(content)).encode()
+    except (ValueError, TypeError):  # changed before
+        return bytes_mutated(content, generator)
+    changed = json_mutated(document, generator)
     try:
         return bytes(msgpack.packb(json.loads(changed)))
     except (ValueError, OverflowError, RecursionError, UnicodeEncodeError):

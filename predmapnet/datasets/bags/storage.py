@@ -58,7 +58,7 @@ class Bag:
             raise UserError("Reading bags needs the extra 'bags': pip install 'predmapnet[bags]'.")
         self.path = path
         found = sorted(path.iterdir()) if path.is_dir() else [path]
-        self.files = [file for file in found if file.name.endswith(ENDINGS) and file.is_file()]
+        self.files = [file for file in found if file.name.lower().endswith(ENDINGS) and file.is_file()]
         self.topics: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self.damage: list[str] = []
@@ -80,7 +80,7 @@ class Bag:
         total, before = sum(file.stat().st_size for file in self.files), 0
         for file in self.files:
             size = file.stat().st_size
-            read = _mcap_messages if ".mcap" in file.suffixes else _sqlite_messages
+            read = _mcap_messages if ".mcap" in file.name.lower() else _sqlite_messages
             contents, timeless = 0, 0
             with _opened(file) as stream:
                 for message in read(self, file, stream, kinds):
@@ -107,7 +107,7 @@ def _opened(file: Path) -> Iterator[IO[bytes]]:
     import zstandard
 
     with file.open("rb") as stream:
-        if file.suffix != ".zstd":
+        if file.suffix.lower() != ".zstd":
             yield stream
             return
         with zstandard.open(stream, "rb", closefd=False) as plain:
@@ -170,7 +170,7 @@ def _sqlite_messages(bag: Bag, file: Path, stream: IO[bytes], kinds: Collection[
     """Yield the messages of an SQLite file."""
     with contextlib.ExitStack() as closing:
         plain = file
-        if file.suffix == ".zstd":
+        if file.suffix.lower() == ".zstd":
             temporary = closing.enter_context(tempfile.NamedTemporaryFile(suffix=".db3"))
             shutil.copyfileobj(stream, temporary)
             temporary.flush()

@@ -32,6 +32,9 @@ MODELS = {
 }
 """Names of camera models, and the lens that each stands for."""
 
+HIGHEST_ORIGIN = 10.0
+"""Metres of a car's frame above the road, or below it."""
+
 MOST_CAMERAS = 8
 """Cameras that the shipped network has learned to look through at once."""
 
@@ -68,6 +71,11 @@ def read_calibration(path: Path) -> LogCalibration:
             "images may stay."
         )
     ground_height = -_number(content, "ego_origin_above_road_m", str(path))
+    if abs(ground_height) > HIGHEST_ORIGIN:
+        raise UserError(
+            f"{path}: the ego origin would be {-ground_height:,.0f} m above the road: is that in millimetres, or a "
+            "height above the sea?"
+        )
     rig = tuple(_camera(name, entry, ground_height, f"{path}, {name}") for name, entry in cameras.items())
     check_cameras([entry["camera_to_ego"]["rotation_wxyz"] for entry in cameras.values()], str(path))
     of = content.get("poses_of")

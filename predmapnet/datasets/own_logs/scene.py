@@ -13,7 +13,7 @@ from mapfusion.elements import GlobalMap, RegionOfInterest
 from mapfusion.formats.local_plane import LocalPlane
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.argoverse2_files import IMAGE_ENDINGS, timed_files
-from predmapnet.datasets.fields import numbers_field
+from predmapnet.datasets.fields import is_given, numbers_field
 from predmapnet.datasets.georeference import local_frame, plane_at
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.datasets.own_logs.calibration import CALIBRATION, read_calibration
@@ -178,7 +178,7 @@ def _how_far(times: Integer, row: int | None, timestamp: int) -> str:
 
 def _georeference(path: Path) -> LocalPlane | None:
     """Read where the origin of the poses lies; x is east, y is north. None where there is no file."""
-    if not path.is_file():
+    if not is_given(path):
         return None
     content = parse_json(path.read_bytes(), path, unique=True)
     record = content if isinstance(content, dict) else {}

@@ -14,7 +14,7 @@ from mapfusion.formats.by_suffix import read_map
 from mapfusion.geometry import FARTHEST_POSE
 from mapfusion.georeference import InvertibleGeoreference
 from mapfusion.ground import region
-from predmapnet.datasets.fields import numbers
+from predmapnet.datasets.fields import is_given, numbers
 from predmapnet.datasets.large_tables import parse_json
 from predmapnet.errors import UserError, value_errors_told
 from predmapnet.scenes import FrameTruth
@@ -37,10 +37,10 @@ def read_truth(folder: Path, georeference: InvertibleGeoreference) -> Lines | No
         UserError: a file is damaged, or lies somewhere else.
     """
     path = folder / "truth.json"
-    if path.is_file():
+    if is_given(path):
         return _read_json(path)
     path = folder / "truth.geojson"
-    if path.is_file():
+    if is_given(path):
         with value_errors_told():
             return [(element.kind, element.points) for element in read_map(path, georeference)]
     return None

@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -130,6 +131,14 @@ def test_an_unclosed_ring_keeps_all_corners(edited):
     assert len(ring) == 5
     np.testing.assert_array_equal(ring[0], ring[-1])
     assert any("not closed" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("kind", ["GeometryCollection", "MultiLineString", "MultiPolygon"])
+def test_a_geometry_without_parts_is_told(edited, kind):
+    member = "geometries" if kind == "GeometryCollection" else "coordinates"
+    found = edited(lambda document: document["features"][0].update(geometry={"type": kind, member: []}))
+    assert len(found) == 1
+    assert found.notes == ("an empty geometry: left out (1 x: feature 0)",)
 
 
 def test_holes_are_told(edited):
@@ -281,11 +290,30 @@ def test_a_geopackage_that_a_program_has_open_is_not_overwritten(tmp_path):
     assert len(read_map(path, PLANE)) == 0
 
 
-@pytest.mark.parametrize("name", ["a!b.gpkg", "a;b.gpkg", "a?b.fgb", "ä ö.gpkg", "a!b.osm"])
+@pytest.mark.parametrize(
+    "name",
+    ["a!b.gpkg", "a;b.gpkg", "a?b.fgb", "ä ö.gpkg", "a!b.osm", "a\nb.gpkg", "a\tb.fgb", "\udcff.gpkg", "\udcff.fgb"],
+)
 def test_names_with_any_characters_are_written_and_read(tmp_path, name):
     write_map(EXAMPLE, tmp_path / name, PLANE)
     assert len(read_map(tmp_path / name, PLANE)) == 2
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".yaml"] == [name]
+
+
+def test_a_name_that_begins_as_one_of_a_driver_is_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_map(EXAMPLE, Path("GPKG:a.gpkg"), PLANE)
+    assert len(read_map(Path("GPKG:a.gpkg"), PLANE)) == 2
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_links_that_lead_in_a_circle_are_told_and_stay(tmp_path, name):
+    (tmp_path / name).symlink_to(tmp_path / f"other-{name}")
+    (tmp_path / f"other-{name}").symlink_to(tmp_path / name)
+    for use in (lambda path: write_map(EXAMPLE, path, PLANE), read_map):
+        with pytest.raises(OSError, match=r"symbolic links|No such file"):
+            use(tmp_path / name)
+    assert (tmp_path / name).is_symlink()
 
 
 @pytest.mark.parametrize("name", FORMATS)

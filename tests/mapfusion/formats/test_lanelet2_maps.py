@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -150,6 +151,12 @@ def test_a_corner_of_a_crossing_that_is_nowhere_is_named(written):
 
     with pytest.raises(ValueError, match=r"map\.osm: feature 3"):
         edit(written, lose)
+
+
+@pytest.mark.parametrize("name", ["node", "way", "relation"])
+def test_two_things_of_one_id_are_refused(written, name):
+    with pytest.raises(ValueError, match=rf"map\.osm: .*the {name} -?\d+ is there twice"):
+        edit(written, lambda root: root.append(deepcopy(root.find(name))))
 
 
 def test_paint_set_in_josm_is_taken(written):

@@ -132,6 +132,19 @@ def test_poses_of_another_scene_and_missing_images_are_told(log, tmp_path):
         log_from_pandaset(scene, tmp_path / "other")
 
 
+def test_damaged_images_are_left_out_and_told(log, tmp_path):
+    scene, drive = write_pandaset(log, tmp_path / "002"), write_kitti(log, tmp_path / "day")
+    (scene / "camera" / "left_camera" / "02.jpg").write_bytes(b"")
+    path = drive / "image_02" / "data" / "0000000003.png"
+    path.write_bytes(path.read_bytes()[:-30])
+    for made, camera in (
+        (log_from_pandaset(scene, tmp_path / "one"), "left_camera"),
+        (log_from_kitti(drive, tmp_path / "two"), "image_02"),
+    ):
+        assert f"lost: 1 damaged images of {camera}" in made.notes
+        assert made.images[camera] == FRAMES - 1 == len(list((made.written / "images" / camera).iterdir()))
+
+
 def test_what_is_no_such_drive_is_told(log, tmp_path):
     drive = write_kitti(log, tmp_path / "day", "00")
     assert log_from_kitti(drive, tmp_path / "grey").images == {"image_00": FRAMES}

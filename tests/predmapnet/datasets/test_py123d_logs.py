@@ -102,6 +102,22 @@ def rewrite(folder: Path, key: str, change) -> None:
         file.write_table(table)
 
 
+def columns(folder: Path, change) -> None:
+    """Change the table of a camera."""
+    path = folder / "camera.pcam_f0.arrow"
+    table = change(pa.ipc.open_file(path.read_bytes()).read_all())
+    with pa.ipc.new_file(str(path), table.schema) as file:
+        file.write_table(table)
+
+
+def times(column):
+    return column.cast(pa.timestamp("us"))
+
+
+def later(column):
+    return pa.array([2**62 + row for row in range(len(column))])
+
+
 def test_cameras_of_other_models_are_left_out_and_told(folder, tmp_path):
     rewrite(folder, "camera.pcam_l0", lambda metadata: metadata.update(camera_model="ftheta"))
     made = log_from_py123d(folder, tmp_path / "out")
@@ -126,8 +142,15 @@ def test_undistorted_images_have_no_lens(folder, tmp_path):
         (lambda folder: rewrite(folder, "camera.pcam_f0", lambda m: m.update(intrinsics=[1.0])), "'intrinsics'"),
         (lambda folder: rewrite(folder, "camera.pcam_f0", lambda m: m.update(camera_to_imu_se3=None)), "a pose needs"),
         (lambda folder: rewrite(folder, "camera.pcam_f0", lambda m: m.update(width=64)), "principal point"),
+        (lambda folder: columns(folder, lambda table: table.append_column(table.schema[0], table[0])), "column twice"),
+        (lambda folder: columns(folder, lambda table: table.set_column(0, table.schema[0].name, times(table[0]))),
+         "whole number of microseconds"),
+        (lambda folder: columns(folder, lambda table: table.set_column(0, table.schema[0].name, later(table[0]))),
+         "whole number of microseconds"),
+        (lambda folder: columns(folder, lambda table: table.set_column(1, table.schema[1].name, [[True] * 12])),
+         "no images and no names"),
     ],
-)
+)  # fmt: skip
 def test_what_is_missing_or_wrong_is_told(folder, tmp_path, change, message):
     change(folder)
     with pytest.raises(UserError, match=message):

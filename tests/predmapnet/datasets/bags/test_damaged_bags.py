@@ -1,10 +1,13 @@
 """Of damaged bags, what can be read becomes a log, and what was lost is said."""
 
 import random
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from predmapnet.datasets.bags.conversion import log_from_bag
 from predmapnet.datasets.bags.storage import ZSTD
@@ -92,3 +95,37 @@ def test_bytes_that_changed_end_in_a_log_or_in_one_message(drawn, tmp_path, stor
             assert not (tmp_path / f"out_{number}").exists()
     assert "log" in outcomes
     assert not [path for path in tmp_path.iterdir() if ".part" in path.name]
+
+
+def test_a_message_of_an_impossible_time_is_lost_alone(drawn, tmp_path):
+    bag = drawn.write(tmp_path / "bag")
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        kinds, found = {}, list(make_reader(stream).iter_messages())
+    with (tmp_path / "late.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for schema, channel, message in found:
+            if channel.topic not in kinds:
+                number = writer.register_schema(schema.name, "ros2msg", b"")
+                kinds[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            time = 2**63 if message is found[-1][2] else message.log_time
+            writer.add_message(kinds[channel.topic], time, message.data, time)
+        writer.finish()
+    report = log_from_bag(tmp_path / "late.mcap", tmp_path / "out")
+    assert "lost: late.mcap: 1 messages of a time that no clock has are lost" in report.notes
+
+
+@pytest.mark.parametrize("change", ["UPDATE topics SET name = x'00'", "UPDATE messages SET timestamp = 9e999"])
+def test_rows_of_other_kinds_are_damage(drawn, tmp_path, change):
+    (file,) = drawn.write(tmp_path / "bag", "sqlite3").glob("*.db3")
+    with closing(sqlite3.connect(file)) as database:
+        database.execute(change)
+        database.commit()
+    with pytest.raises(UserError, match=r"Lost: bag\.db3 is damaged"):
+        log_from_bag(file, tmp_path / "out")
+
+
+def test_endings_may_be_capital_letters(drawn, tmp_path):
+    (file,) = drawn.write(tmp_path / "bag").glob("*.mcap")
+    assert log_from_bag(file.rename(tmp_path / "BAG.MCAP"), tmp_path / "out").notes == []

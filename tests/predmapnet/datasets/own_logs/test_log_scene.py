@@ -225,6 +225,26 @@ def test_a_wrong_calibration_is_refused_with_its_place(folder, change, message):
     assert "calibration.json" in str(caught.value)
 
 
+@pytest.mark.parametrize("height", [1500.0, -300.0])
+def test_an_origin_far_from_the_road_is_refused(folder, height):
+    path = folder / "calibration.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "ego_origin_above_road_m": height}))
+    with pytest.raises(UserError, match=r"calibration\.json.* above the road"):
+        LogScene(folder)
+
+
+@pytest.mark.parametrize("name", ["truth.json", "truth.geojson", "georeference.json"])
+def test_a_link_to_nothing_or_a_folder_is_no_lack_of_a_file(folder, name):
+    (folder / "truth.json").unlink(missing_ok=True)
+    (folder / name).symlink_to("nowhere.json")
+    with pytest.raises((OSError, UserError), match="No such file"):
+        LogScene(folder).truth_map()
+    (folder / name).unlink()
+    (folder / name).mkdir()
+    with pytest.raises((OSError, UserError), match=r"[Ii]s a directory"):
+        LogScene(folder).truth_map()
+
+
 @pytest.mark.parametrize("name", ["calibration.json", "poses.csv"])
 def test_a_missing_file_is_named(folder, name):
     (folder / name).unlink()

@@ -164,6 +164,14 @@ def test_what_no_car_drives_is_refused_with_its_place(tmp_path, change, message)
     assert "poses.csv" in str(caught.value)
 
 
+def test_columns_between_semicolons_are_named(tmp_path):
+    write_timed_poses(tmp_path / "poses.csv", curve())
+    path = tmp_path / "poses.csv"
+    path.write_text(path.read_text().replace(",", ";"))
+    with pytest.raises(UserError, match="the columns are: timestamp_ns;x;y"):
+        read_timed_poses(tmp_path)
+
+
 def test_text_files_that_are_neither_are_refused(tmp_path):
     path = tmp_path / "poses.txt"
     for text, message in (("1 2 3\n", "8 .TUM."), ("", "no pose"), ("a b c d e f g h\n", "line 1"), (
