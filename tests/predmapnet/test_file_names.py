@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from predmapnet.errors import UserError
-from predmapnet.files import check_output, file_name
+from predmapnet.evaluation.comparison import compare_evaluations
+from predmapnet.files import check_output, file_name, whole_folder
 
 
 @given(st.text(max_size=300))
@@ -45,3 +46,15 @@ def test_a_file_that_a_program_has_open_is_refused_before_the_work(tmp_path, com
 def test_another_ending_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"only \.rrd"):
         check_output(tmp_path / "recording.txt", (".rrd",))
+
+
+def test_links_that_lead_in_a_circle_are_told(tmp_path):
+    circle, other = tmp_path / "circle.json", tmp_path / "other.json"
+    circle.symlink_to(other)
+    other.symlink_to(circle)
+    with pytest.raises(OSError, match="symbolic links"):
+        check_output(circle)
+    with pytest.raises(UserError, match="exists already"), whole_folder(circle):
+        pass
+    with pytest.raises(UserError, match=r"no file .*circle\.json"):
+        compare_evaluations([circle, other])
