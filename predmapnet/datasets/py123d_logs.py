@@ -106,7 +106,7 @@ def _column(table: pa.Table, name: str, path: Path) -> list[Any]:
     return list(table[name].to_pylist())
 
 
-def _times(table: pa.Table, path: Path) -> list[int | None]:
+def _times(table: pa.Table, path: Path) -> list[Any]:
     """Return the times of the rows, nanoseconds; None where there is none."""
     times = _column(table, "timestamp_us", path)
     for time in times:
