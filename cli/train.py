@@ -85,9 +85,9 @@ def train(
 
     from cli.console import print_json
     from predmapnet.demo_world.catalogue import default_cache
+    from predmapnet.frame_cache.prepare import DataOptions, parse_data_sets
     from predmapnet.presets import load_config
     from predmapnet.training import run
-    from predmapnet.training.data.prepare import DataOptions, parse_data_sets
     from predmapnet.training.loop import LoopSettings
     from predmapnet.training.plan import PlanOptions
     from predmapnet.training.processes import leads, usual_devices

@@ -6,7 +6,7 @@ pose, calibration, truth and depth, each with a checksum; ``index.npz`` is writt
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from hashlib import sha256
@@ -151,3 +151,24 @@ class CachedScene:
                 camera_valid=valid,
                 depth=arrays["depth"].astype(np.int64) if "depth" in arrays else None,
             )
+
+
+@dataclass(frozen=True)
+class TrainingScenes:
+    """Cached scenes of any cars, to be trained on.
+
+    Attributes:
+        scenes: all of them.
+        weights: of each scene: how often each of its frames is seen in an epoch.
+        config: of the network.
+    """
+
+    scenes: Sequence[CachedScene]
+    weights: Sequence[float]
+    config: PredMapNetConfig
+
+    @property
+    def digest(self) -> str:
+        """Tell what is drawn from: scenes, their order and their weights."""
+        named = [(scene.folder.parent.name, scene.name, len(scene)) for scene in self.scenes]
+        return sha256(repr((named, list(self.weights))).encode()).hexdigest()[:20]

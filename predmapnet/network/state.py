@@ -169,6 +169,20 @@ class StreamState:
             **parts[""],
         )
 
+    def forgotten(self, streams: Tensor) -> StreamState:
+        """Return the state with some streams ``(B,) bool`` as if they had just begun."""
+        tensors = self.tensors()
+        for name, value in tensors.items():
+            # Poses stay valid ones, and the large maps are not looked at.
+            if not name.endswith(("ego_to_global", "pose", "poses", "bev_memory")):
+                nothing = -1 if name.endswith("track_ids") else 0
+                tensors[name] = value.masked_fill(streams.view(-1, *[1] * (value.ndim - 1)), nothing)
+        return StreamState.from_tensors(tensors)
+
+    def detached(self) -> StreamState:
+        """Return the state without its gradient history."""
+        return StreamState.from_tensors({name: value.detach() for name, value in self.tensors().items()})
+
 
 @dataclass
 class LayerPredictions:

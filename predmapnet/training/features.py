@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
+from predmapnet.files import write_file
+from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import Report
+from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import collate_frames
-from predmapnet.training.data.draws import TrainingScenes
-from predmapnet.training.data.streams import FeatureStore
 
 ENCODERS = ("image_backbone", "bev_encoder")
 ENCODE_BATCH = 4
@@ -32,6 +37,43 @@ def feature_shapes(network: PredMapNet) -> tuple[tuple[int, ...], ...]:
         )
     sizes = [(-(-bev.rows // scale), -(-bev.columns // scale)) for scale in (1, 2, 4)]
     return tuple((width, *size) for width, size in zip(bev.widths, sizes, strict=True))
+
+
+class FeatureStore:
+    """BEV features of all frames in half precision, one file per scene, named after what is in the scene.
+
+    Every other scene is stored mirrored, so that both hands of the world are seen.
+    """
+
+    def __init__(self, folder: Path, shapes: tuple[tuple[int, ...], ...], scenes: Sequence[CachedScene]) -> None:
+        """Use a folder that belongs to the encoders, the shapes ``(C, H, W)`` of the levels, and the scenes."""
+        self._shapes = shapes
+        named = (f"{scene.digest()}{'-mirrored' * self.mirrored(at)}.npy" for at, scene in enumerate(scenes))
+        self._paths = [folder / name for name in named]
+        folder.mkdir(parents=True, exist_ok=True)
+
+    @staticmethod
+    def mirrored(scene: int) -> bool:
+        """Whether a scene is stored mirrored."""
+        return scene % 2 == 1
+
+    def has(self, scene: int) -> bool:
+        """Whether a scene is complete."""
+        return self._paths[scene].exists()
+
+    def write(self, scene: int, features: Sequence[BevFeatures]) -> None:
+        """Store the features of all frames of a scene, in batches in their order."""
+        rows = [torch.cat([level.flatten(1) for level in each.levels], 1).half().cpu() for each in features]
+        with write_file(self._paths[scene]) as temporary:
+            np.save(temporary, torch.cat(rows).numpy())
+
+    def read(self, scenes: NDArray[np.int64], frames: NDArray[np.int64]) -> BevFeatures:
+        """Return the features of one frame of each of several scenes."""
+        files = (np.load(self._paths[scene], mmap_mode="r") for scene in scenes)
+        rows = torch.from_numpy(np.stack([file[frame] for file, frame in zip(files, frames, strict=True)]))
+        parts = rows.float().split([int(np.prod(shape)) for shape in self._shapes], 1)
+        levels = [part.reshape(-1, *shape) for part, shape in zip(parts, self._shapes, strict=True)]
+        return BevFeatures([level.contiguous(memory_format=torch.channels_last) for level in levels])
 
 
 @torch.no_grad()
@@ -55,7 +97,7 @@ def fill_features(
         features = []
         for start in range(0, frames := len(scenes.scenes[scene]), ENCODE_BATCH):
             numbers = range(start, min(start + ENCODE_BATCH, frames))
-            loaded = [scenes.load(scene, frame, store.mirrored(scene)) for frame in numbers]
+            loaded = [load_frame(scenes, scene, frame, store.mirrored(scene)) for frame in numbers]
             inputs = collate_frames(loaded, config).inputs(network)
             features.append(network.encode_bev(network.encode_images(inputs), inputs))
         store.write(scene, features)

@@ -126,7 +126,7 @@ class StageTraining(nn.Module):
                 assert past.state is not None
                 add_forecasts(sums, past.state.forecasts, past.owners, truths[number + 1], self._size, weights)
         if stage.data == "streams" and past.state is not None:
-            self.carried = Past(detached(past.state), past.owners)
+            self.carried = Past(past.state.detached(), past.owners)
         return sums.means(self.shared, self.processes, 1 / count if weights.mean_over_frames else 1.0)
 
     def tensors(self) -> dict[str, Tensor]:
@@ -151,7 +151,7 @@ class StageTraining(nn.Module):
         if segment.fresh is None or self.stage.tracks is None or past.state is None:
             return past
         forgetful = torch.tensor([each.random() < self.stage.tracks.state_dropout for each in draws])
-        return Past(forget(past.state, (segment.fresh | forgetful).to(self.network.device)), past.owners)
+        return Past(past.state.forgotten((segment.fresh | forgetful).to(self.network.device)), past.owners)
 
     def _encode(
         self, inputs: FrameInputs, seen: StreamState | None, instant: Batch, trained: bool, sums: LossSums
@@ -256,19 +256,3 @@ def named_instances(outputs: FrameOutputs, chosen: Chosen, state: StreamState) -
     former = nn.functional.pad(state.instances.track_ids, (0, 1), value=-1)
     kept_ids = former[torch.arange(len(rows), device=rows.device)[:, None], identity]
     return instances_from_rows(outputs, rows, valid, torch.where(newborn, fresh_ids, kept_ids))
-
-
-def forget(state: StreamState, streams: Tensor) -> StreamState:
-    """Return the state with some streams ``(B,) bool`` as if they had just begun."""
-    tensors = state.tensors()
-    for name, value in tensors.items():
-        # Poses stay valid ones, and the large maps are not looked at.
-        if not name.endswith(("ego_to_global", "pose", "poses", "bev_memory")):
-            nothing = -1 if name.endswith("track_ids") else 0
-            tensors[name] = value.masked_fill(streams.view(-1, *[1] * (value.ndim - 1)), nothing)
-    return StreamState.from_tensors(tensors)
-
-
-def detached(state: StreamState) -> StreamState:
-    """Return the state without its gradient history."""
-    return StreamState.from_tensors({name: value.detach() for name, value in state.tensors().items()})

@@ -13,7 +13,6 @@ from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapN
 from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
 from predmapnet.errors import UserError
 from predmapnet.training.data.augmentation import AugmentationSettings
-from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.losses.weights import LITE_LOSSES, PAPER_LOSSES, LossWeights
 
 
@@ -46,31 +45,6 @@ class OptimiserSettings:
 
 
 @dataclass(frozen=True)
-class ClipSettings:
-    """Clips: a frame, and ``frames - 1`` others drawn from the ``span`` frames before it."""
-
-    frames: int = 5
-    span: int = 10
-
-
-@dataclass(frozen=True)
-class StreamSettings:
-    """Streams that carry their state across optimiser steps.
-
-    Attributes:
-        streams: side by side in one process.
-        frames: consecutive frames that share a gradient.
-        longest: longest stream, frames; it grows from ``frames`` to this over ``growth_steps`` steps.
-        growth_steps: see above.
-    """
-
-    streams: int = 4
-    frames: int = 2
-    longest: int = 40
-    growth_steps: int = 400
-
-
-@dataclass(frozen=True)
 class TrackRules:
     """Rules by which rows of a frame become tracks of the next one.
 
@@ -100,6 +74,7 @@ class Stage:
         data: single ``frames``; ``clips`` of images; or ``streams`` over BEV features that are computed once.
         epochs: how often each frame is seen; a frame of a clip counts as its last one.
         batch: frames, clips or streams of one step over all processes, for which the learning rate holds.
+        frames: of one sample, which share a gradient: 1, those of a clip, or those of a stream in one step.
         per_device: those of one GPU by default; None takes ``batch`` whatever the number of devices.
         share: of a budget of minutes.
         losses: their weights.
@@ -113,13 +88,15 @@ class Stage:
         angle_noise: deviation of the Euler angles of the ego motion, radians.
         distance_noise: deviation of its x and y, metres.
         augmentation: changes to frames.
-        clips, streams: sizes of the data.
+        span: the other frames of a clip are drawn from so many before its last one.
+        longest: longest stream, frames; it grows from ``frames`` to this over ``growth_steps`` steps.
     """
 
     name: str
     data: Literal["frames", "clips", "streams"]
     epochs: int
     batch: int
+    frames: int
     losses: LossWeights
     optimiser: OptimiserSettings
     per_device: int | None = None
@@ -132,18 +109,14 @@ class Stage:
     angle_noise: float = 0.0
     distance_noise: float = 0.0
     augmentation: AugmentationSettings = field(default_factory=AugmentationSettings)
-    clips: ClipSettings = field(default_factory=ClipSettings)
-    streams: StreamSettings = field(default_factory=StreamSettings)
+    span: int = 10
+    longest: int = 40
+    growth_steps: int = 400
 
     def trains_images(self, number: int, frames: int) -> bool:
         """Whether the images of frame ``number`` of ``frames`` are trained on."""
         first, last = self.images == "first and last" and number == 0, number == frames - 1
         return self.images != "none" and (first or last)
-
-    @property
-    def frames(self) -> int:
-        """Frames of one sample."""
-        return {"frames": 1, "clips": self.clips.frames, "streams": self.streams.frames}[self.data]
 
 
 BEV_PARTS = ("image_backbone", "bev_encoder", "segmentation_head", "depth_head")
@@ -168,7 +141,7 @@ MAPTRACKER_AUGMENTATION = AugmentationSettings(
     mirror=0.0,
     grid_mask=0.7,
     camera_dropout=0.0,
-    calibration=CalibrationNoise(probability=0.0),
+    bumped=0.0,
 )
 
 
@@ -180,6 +153,7 @@ def _paper_stages(bev: int, warmup: int, joint: int) -> tuple[Stage, ...]:
         data="clips",
         epochs=bev,
         batch=MAPTRACKER_GPUS,
+        frames=5,
         per_device=1,
         losses=PAPER_LOSSES,
         optimiser=optimiser,
@@ -201,12 +175,13 @@ def _paper_stages(bev: int, warmup: int, joint: int) -> tuple[Stage, ...]:
 NUSCENES_STAGES = _paper_stages(bev=18, warmup=6, joint=48)
 ARGOVERSE2_STAGES = _paper_stages(bev=12, warmup=3, joint=20)
 LITE_STAGES = (
-    Stage("single", "frames", epochs=24, batch=6, share=2, losses=LITE_LOSSES, optimiser=OptimiserSettings()),
+    Stage("single", "frames", epochs=24, batch=6, frames=1, share=2, losses=LITE_LOSSES, optimiser=OptimiserSettings()),
     Stage(
         "temporal",
         "streams",
         epochs=24,
         batch=8,
+        frames=2,
         losses=LITE_LOSSES,
         optimiser=OptimiserSettings(learning_rate=5e-4),
         tracks=TrackRules(0.3, track_dropout=0.12, state_dropout=0.03, false_tracks=3, refresh=0.3, capacity=40),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import count
 from zlib import crc32
 
 import torch
 
+from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.training.data.batches import StreamSegment
-from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips, TrainingScenes, step_loader
-from predmapnet.training.data.streams import FeatureStore, Streams
+from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips, step_loader
+from predmapnet.training.data.streams import Streams
+from predmapnet.training.features import FeatureStore
 from predmapnet.training.plan import PlannedStage
 
 
@@ -32,12 +33,10 @@ class StageData:
         stage, seeds = planned.stage, (seed, crc32(planned.stage.name.encode()))
         self._batch, self._place, self._workers = planned.batch // planned.parts, (rank, size), workers
         if store is not None:
-            streams = replace(stage.streams, streams=planned.share)
-            self._drawn: Streams | Clips = Streams(scenes, store, streams, stage.augmentation, seeds, rank, size)
-        elif stage.data == "frames":
-            self._drawn = Clips(scenes, stage.augmentation, seeds, crossing_weight=CROSSING_WEIGHT)
+            self._drawn: Streams | Clips = Streams(scenes, store, stage, planned.share, seeds, rank, size)
         else:
-            self._drawn = Clips(scenes, stage.augmentation, seeds, stage.clips.frames, stage.clips.span)
+            crossings = CROSSING_WEIGHT if stage.data == "frames" else 1.0
+            self._drawn = Clips(scenes, stage.augmentation, seeds, stage.frames, stage.span, crossings)
 
     def segments(self, first: int) -> Iterator[StreamSegment]:
         """Yield them without an end, from number ``first`` on."""

@@ -24,9 +24,9 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.errors import UserError
 from predmapnet.files import check_output, write_file
+from predmapnet.frame_cache.prepare import DataOptions, parse_data_sets, prepare_data
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
-from predmapnet.training.data.prepare import DataOptions, parse_data_sets, prepare_data
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlanOptions
 from predmapnet.training.processes import usual_devices

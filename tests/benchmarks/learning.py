@@ -32,11 +32,11 @@ from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
+from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data
 from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.training.data.batches import StreamSegment, collate_frames
-from predmapnet.training.data.prepare import DataOptions, DataSet, prepare_data
 from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
 from predmapnet.training.run import RunOptions, train_network

@@ -17,11 +17,11 @@ from typing import TypeVar
 import torch
 
 from predmapnet.demo_world.catalogue import default_cache
+from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data
 from predmapnet.machine import use_threads
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips
-from predmapnet.training.data.prepare import DataOptions, DataSet, prepare_data
 from predmapnet.training.instants import StageTraining
 from predmapnet.training.optimiser import WeightAverage, make_optimiser
 from predmapnet.training.settings import LITE_STAGES

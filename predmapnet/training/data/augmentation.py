@@ -11,9 +11,9 @@ import torch
 
 from mapfusion.arrays import Bool, Byte, Float
 from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
-from predmapnet.frame_cache.scene_cache import CachedFrame
+from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
 from predmapnet.network.image_input import input_size
-from predmapnet.training.data.calibration_noise import CalibrationNoise, perturb_calibration
+from predmapnet.training.data.calibration_noise import perturb_calibration
 from predmapnet.training.data.photography import (
     PhotographySettings,
     add_noise,
@@ -37,7 +37,7 @@ class AugmentationSettings:
         photography: light, lenses, sensors and files.
         grid_mask: probability that a grid covers a quarter of the images of a frame; MapTracker's is 0.7.
         camera_dropout: probability that one camera of a frame is missing; the last one never is.
-        calibration: how wrong the calibration is that the network is told.
+        bumped: probability that the calibration that the network is told is wrong.
         pose_metres, pose_degrees: standard deviation of the places and headings of the frames of a stream.
     """
 
@@ -45,9 +45,15 @@ class AugmentationSettings:
     photography: PhotographySettings = field(default_factory=PhotographySettings)
     grid_mask: float = 0.0
     camera_dropout: float = 0.05
-    calibration: CalibrationNoise = field(default_factory=CalibrationNoise)
+    bumped: float = 0.6
     pose_metres: float = 0.05
     pose_degrees: float = 0.1
+
+
+def load_frame(scenes: TrainingScenes, scene: int, frame: int, mirrored: bool, images: bool = True) -> CachedFrame:
+    """Read one frame, mirrored or not."""
+    stored = scenes.scenes[scene].frame(frame, images)
+    return mirror(stored, scenes.config) if mirrored else stored
 
 
 def mirror(frame: CachedFrame, config: PredMapNetConfig) -> CachedFrame:
@@ -93,7 +99,7 @@ def augment(
 ) -> CachedFrame:
     """Take a frame again; ``bump`` is the seed of the calibration's error, which the frames of a clip share."""
     images = cover_grid(change_light(frame.images, settings, generator), settings.grid_mask, config, generator)
-    calibration = perturb_calibration(frame.calibration, settings.calibration, np.random.default_rng(bump))
+    calibration = perturb_calibration(frame.calibration, settings.bumped, np.random.default_rng(bump))
     valid = drop_camera(frame.camera_valid, settings, generator)
     return replace(frame, images=images, camera_valid=valid, calibration=calibration)
 

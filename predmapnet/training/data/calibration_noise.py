@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -10,45 +10,33 @@ import torch
 
 from predmapnet.network.calibration import Calibration
 
-
-@dataclass(frozen=True)
-class CalibrationNoise:
-    """Distance between the calibration that the network is told and the true one.
-
-    Attributes:
-        probability: of a frame whose calibration is wrong at all.
-        degrees: standard deviation of each camera's rotation about each axis, where it is wrong.
-        common_degrees: that of the whole rig, as of a car that is loaded unevenly.
-        metres: standard deviation of each camera's position along each axis.
-    """
-
-    probability: float = 0.6
-    degrees: float = 0.75
-    common_degrees: float = 0.4
-    metres: float = 0.02
+DEGREES = 0.75
+"""Standard deviation of each camera's rotation about each axis, where the calibration is wrong."""
+COMMON_DEGREES = 0.4
+"""That of the whole rig, as of a car that is loaded unevenly."""
+METRES = 0.02
+"""Standard deviation of each camera's position along each axis."""
 
 
-def perturb_calibration(
-    calibration: Calibration, noise: CalibrationNoise, generator: np.random.Generator
-) -> Calibration:
+def perturb_calibration(calibration: Calibration, probability: float, generator: np.random.Generator) -> Calibration:
     """Return a wrong calibration of the cameras of one frame; what their images show does not change.
 
     Args:
         calibration: the true one, of one frame.
-        noise: how wrong.
+        probability: that it is wrong at all.
         generator: source of randomness; the same state gives the same result.
     """
-    if generator.random() >= noise.probability:
+    if generator.random() >= probability:
         return calibration
     # Most calibrations are better than the worst ones: how bad this one is varies as well.
     strength = generator.uniform(0.0, 1.7)
-    common = generator.normal(0.0, noise.common_degrees, 3)
+    common = generator.normal(0.0, COMMON_DEGREES, 3)
     projections = calibration.ego_to_image[0].numpy().copy()
     for index, projection in enumerate(projections):
-        angles = np.radians(strength * (common + generator.normal(0.0, noise.degrees, 3)))
+        angles = np.radians(strength * (common + generator.normal(0.0, DEGREES, 3)))
         rotation, _ = cv2.Rodrigues(angles)
         position = -np.linalg.solve(projection[:, :3], projection[:, 3])
-        moved = position + strength * generator.normal(0.0, noise.metres, 3)
+        moved = position + strength * generator.normal(0.0, METRES, 3)
         # The camera turns about itself: (M R | -M R c') looks from c' along the turned axes.
         turned = projection[:, :3] @ rotation
         projections[index] = np.column_stack([turned, -turned @ moved])

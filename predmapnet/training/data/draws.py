@@ -7,8 +7,6 @@ on with the same frames, and two processes see what one would have seen with the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from hashlib import sha256
 from itertools import count
 from typing import Any
 
@@ -18,11 +16,10 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from mapfusion.arrays import Float
-from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.frame_cache.scene_cache import CachedFrame, CachedScene
+from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
 from predmapnet.machine import begin_loading
-from predmapnet.training.data.augmentation import AugmentationSettings, augment, mirror
+from predmapnet.training.data.augmentation import AugmentationSettings, augment, load_frame
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 
 CROSSING_WEIGHT = 2.5
@@ -30,32 +27,6 @@ CROSSING_WEIGHT = 2.5
 and a random half of them a third time."""
 PARTS_OF_WEIGHTS = 1024
 """Weights are multiples of one of these parts, so that their sums are exact."""
-
-
-@dataclass(frozen=True)
-class TrainingScenes:
-    """Cached scenes of any cars.
-
-    Attributes:
-        scenes: all of them.
-        weights: of each scene: how often each of its frames is seen in an epoch.
-        config: of the network.
-    """
-
-    scenes: Sequence[CachedScene]
-    weights: Sequence[float]
-    config: PredMapNetConfig
-
-    @property
-    def digest(self) -> str:
-        """Tell what is drawn from: scenes, their order and their weights."""
-        named = [(scene.folder.parent.name, scene.name, len(scene)) for scene in self.scenes]
-        return sha256(repr((named, list(self.weights))).encode()).hexdigest()[:20]
-
-    def load(self, scene: int, frame: int, mirrored: bool, images: bool = True) -> CachedFrame:
-        """Read one frame, mirrored or not."""
-        stored = self.scenes[scene].frame(frame, images)
-        return mirror(stored, self.config) if mirrored else stored
 
 
 class EpochOrder:
@@ -138,7 +109,7 @@ class Clips(Dataset[list[CachedFrame]]):
         back = generator.choice(np.arange(1, self._span + 1), self._frames - 1, replace=False)
         bump = int(generator.integers(2**32))
         numbers = sorted(max(0, last - steps) for steps in [*back.tolist(), 0])
-        loaded = (self._scenes.load(scene, number, mirrored) for number in numbers)
+        loaded = (load_frame(self._scenes, scene, number, mirrored) for number in numbers)
         return [augment(frame, self._augmentation, self._scenes.config.image, generator, bump) for frame in loaded]
 
     def name(self, draw: int) -> str:

@@ -14,7 +14,6 @@ from predmapnet.network.polylines import clip_polylines
 from predmapnet.network.revival import point_line_distances
 from predmapnet.network.state import FrameInputs, FrameOutputs, LayerPredictions, StreamState
 from predmapnet.network.track_selection import select
-from predmapnet.training.instants import detached, forget
 
 ROI = torch.tensor([60.0, 30.0])
 DIVIDER, BOUNDARY = 1, 2
@@ -259,8 +258,8 @@ def test_lost_tracks_are_saved_and_forgotten_with_the_state(network):
     restored = StreamState.from_tensors(before).tensors()
     assert restored.keys() == before.keys() and "lost.track_ids" in before
     assert all(torch.equal(restored[name], value) for name, value in before.items())
-    assert detached(both.state).lost.valid.tolist() == [[True], [True]]
-    both.state = forget(both.state, torch.tensor([True, False]))
+    assert both.state.detached().lost.valid.tolist() == [[True], [True]]
+    both.state = both.state.forgotten(torch.tensor([True, False]))
     # The forgetful stream counts from 0 again; were the lost one kept, its next line would be found to be it.
     assert both.state.lost.valid.tolist() == [[False], [True]]
     assert both.step([(DIVIDER, line(5.0)), *ONE], ONE) == [[0, 1], [0]]

@@ -14,11 +14,10 @@ from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.frame_cache.depth_targets import depth_of_frame
 from predmapnet.frame_cache.fill_cache import write_index
-from predmapnet.frame_cache.scene_cache import CachedScene, frame_arrays, frame_path, write_arrays
+from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes, frame_arrays, frame_path, write_arrays
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import window_intrinsics
 from predmapnet.scenes import FrameTruth, Rig
-from predmapnet.training.data.draws import TrainingScenes
 from tests.predmapnet.small_networks import small_config
 
 COLOURS = ((255, 60, 60), (255, 255, 255), (60, 120, 255))

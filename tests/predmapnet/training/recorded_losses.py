@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.network.calibration import Calibration, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.scenes import FrameTruth
+from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import Batch, StreamSegment
-from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.instants import StageTraining
 from predmapnet.training.settings import choose_stages
@@ -53,7 +54,7 @@ def tiny_network(name: str) -> PredMapNet:
 def batch_of(scenes: TrainingScenes, frames: list[tuple[int, int]], mirrored: bool = False) -> Batch:
     """Frames of some scenes as they are stored."""
     config = tiny_config()
-    loaded = [scenes.load(scene, frame, mirrored) for scene, frame in frames]
+    loaded = [load_frame(scenes, scene, frame, mirrored) for scene, frame in frames]
     generator = torch.Generator().manual_seed(frames[0][1])
     images = torch.from_numpy(np.stack([frame.images for frame in loaded]))
     cells = (len(frames), images.shape[1], images.shape[2] // 8, images.shape[3] // 8)

@@ -10,13 +10,13 @@ from pathlib import Path
 import orjson
 from lightning_fabric import Fabric
 
+from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.batches import StreamSegment
-from predmapnet.training.data.draws import TrainingScenes
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlannedStage, PlanOptions, plan_stages
-from predmapnet.training.settings import ClipSettings, Stage
+from predmapnet.training.settings import Stage
 from predmapnet.training.stage_data import StageData
 
 OFTEN = LoopSettings(checkpoint_minutes=0.0, log_steps=1)
@@ -95,5 +95,5 @@ def metrics(folder: Path) -> list[dict[str, float]]:
 
 
 def short_clips(stage: Stage) -> Stage:
-    """A stage with clips of two frames."""
-    return replace(stage, clips=ClipSettings(frames=2, span=3))
+    """A stage whose clips have two frames."""
+    return replace(stage, frames=2, span=3) if stage.data == "clips" else stage

@@ -20,7 +20,6 @@ from predmapnet.training.data.augmentation import (
     drop_camera,
     mirror,
 )
-from predmapnet.training.data.calibration_noise import CalibrationNoise
 from predmapnet.training.data.photography import PhotographySettings
 from tests.predmapnet.network.mirrored_rig import mirror_rig
 
@@ -80,9 +79,9 @@ def test_a_frame_is_taken_again_in_all_the_ways_that_are_asked_for():
     asked = {
         "images": {"photography": PhotographySettings(exposure=1.5, noise=10.0)},
         "camera_valid": {"camera_dropout": 1.0},
-        "calibration": {"calibration": CalibrationNoise(probability=1.0)},
+        "calibration": {"bumped": 1.0},
     }
-    exact = AugmentationSettings(photography=nothing, camera_dropout=0.0, calibration=CalibrationNoise(probability=0.0))
+    exact = AugmentationSettings(photography=nothing, camera_dropout=0.0, bumped=0.0)
     for changed in (None, *asked):
         settings = replace(exact, **asked.get(changed, {}))
         again = augment(frame, settings, LITE.image, generator, bump=1)

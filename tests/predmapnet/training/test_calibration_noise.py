@@ -6,10 +6,10 @@ import torch
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate
 from predmapnet.presets import preset
-from predmapnet.training.data.calibration_noise import CalibrationNoise, perturb_calibration
+from predmapnet.training.data.calibration_noise import perturb_calibration
 
 TRUE = calibrate(DEMO_RIG, preset("lite"))
-ALWAYS = CalibrationNoise(probability=1.0)
+ALWAYS = 1.0
 
 
 def parts(projection):
@@ -42,6 +42,5 @@ def test_cameras_turn_about_a_degree_keep_their_optics_and_stay_where_they_are()
 
 
 def test_as_many_calibrations_stay_right_as_asked_for():
-    noise = CalibrationNoise(probability=0.5)
-    same = [perturb_calibration(TRUE, noise, np.random.default_rng(seed)) is TRUE for seed in range(200)]
+    same = [perturb_calibration(TRUE, 0.5, np.random.default_rng(seed)) is TRUE for seed in range(200)]
     assert 0.35 < np.mean(same) < 0.65

@@ -1,6 +1,7 @@
 """Epochs: everything comes as often as it should, in an order that hangs on nothing but seed and number."""
 
 from collections import Counter
+from dataclasses import replace
 from itertools import islice, pairwise
 
 import numpy as np
@@ -10,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from predmapnet.errors import UserError
-from predmapnet.frame_cache.scene_cache import CachedScene
+from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes
 from predmapnet.network.state import BevFeatures
-from predmapnet.training.data.augmentation import AugmentationSettings
-from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, TrainingScenes, step_loader
-from predmapnet.training.data.streams import FeatureStore, Streams
+from predmapnet.training.data.augmentation import AugmentationSettings, load_frame
+from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, step_loader
+from predmapnet.training.data.streams import Streams
 from predmapnet.training.data.targets import truth_targets
-from predmapnet.training.settings import StreamSettings
+from predmapnet.training.features import FeatureStore
+from predmapnet.training.settings import LITE_STAGES
 from tests.predmapnet.training.painted_scenes import painted_scene, painted_scenes, tiny_config
 
 CONFIG = tiny_config()
@@ -114,15 +116,16 @@ def test_weights_of_scenes_and_of_crossings_decide_how_often_a_frame_is_seen(sce
     assert begun["scene-1"] == pytest.approx(3 * begun["scene-0"], rel=0.4)
 
 
-def streams_of(scenes, folder, count, settings=None, augmentation=None):
+EXACT = replace(LITE_STAGES[1], augmentation=AugmentationSettings(pose_metres=0.0, pose_degrees=0.0), longest=6)
+
+
+def streams_of(scenes, folder, count, **changes):
     """Streams whose features tell scene and frame: ten times the one, and the other."""
     store = FeatureStore(folder, ((1, 2, 2),), scenes.scenes)
     for number, scene in enumerate(scenes.scenes):
         rows = torch.arange(float(len(scene)))[:, None, None, None] + 10 * number
         store.write(number, [BevFeatures([rows.expand(len(scene), 1, 2, 2)])])
-    exact = AugmentationSettings(pose_metres=0.0, pose_degrees=0.0)
-    settings = settings or StreamSettings(streams=count, frames=2, longest=6, growth_steps=1)
-    return Streams(scenes, store, settings, augmentation or exact, (0, 2))
+    return Streams(scenes, store, replace(EXACT, **({"growth_steps": 1} | changes)), count, (0, 2))
 
 
 def named_fresh(streams, step):
@@ -172,7 +175,7 @@ def test_streams_see_the_truth_of_their_frame_of_their_hand_and_of_the_frame_tha
 
 def targets_of(scenes, scene, frame):
     """Truth of a frame as it is stored: scenes of odd numbers mirrored."""
-    loaded = scenes.load(scene, frame, FeatureStore.mirrored(scene), images=False)
+    loaded = load_frame(scenes, scene, frame, FeatureStore.mirrored(scene), images=False)
     return truth_targets([loaded.truth], CONFIG.roi, CONFIG.decoder.points, None)
 
 
@@ -189,7 +192,7 @@ def test_poses_of_streams_are_as_wrong_as_asked_for(scenes, tmp_path):
 def test_drives_begin_anywhere_have_any_length_and_scenes_that_are_too_short_are_left_out(scenes, tmp_path):
     short = painted_scene(tmp_path / "short", 2, 9, CONFIG)
     mixed = TrainingScenes([short, *scenes.scenes], [1.0] * 3, CONFIG)
-    streams = streams_of(mixed, tmp_path / "run", 2, StreamSettings(2, 3, 6, 1))
+    streams = streams_of(mixed, tmp_path / "run", 2, frames=3)
     names = {name for step in range(30) for name in named_fresh(streams, step)}
     assert not any(name.startswith("short") for name in names)
     assert len({name.split()[2] for name in names}) > 2
@@ -202,9 +205,8 @@ def test_streams_go_on_from_step_to_step_and_can_begin_at_any(scenes, tmp_path):
     for scene in range(2):
         rows = torch.arange(6.0)[:, None, None, None] + 10 * scene
         store.write(scene, [BevFeatures([rows.expand(6, 1, 2, 2)])])
-    settings = StreamSettings(streams=2, frames=2, longest=6, growth_steps=4)
-    exact = AugmentationSettings(pose_metres=0.0, pose_degrees=0.0)
-    streams = Streams(scenes, store, settings, exact, (0, 2))
+    growing = replace(EXACT, growth_steps=4)
+    streams = Streams(scenes, store, growing, 2, (0, 2))
     steps = [streams[step] for step in range(14)]
     for before, after in pairwise(steps):
         last, first = (each.features[which].levels[0][:, 0, 0, 0] for each, which in ((before, 1), (after, 0)))
@@ -213,9 +215,9 @@ def test_streams_go_on_from_step_to_step_and_can_begin_at_any(scenes, tmp_path):
                 assert first[stream] == last[stream] + 1
                 assert len(before.after.frame[before.after.frame == stream]) > 0
     assert 2 < sum(int(each.fresh.sum()) for each in steps) < 28
-    again = Streams(scenes, store, settings, exact, (0, 2))[9]
+    again = Streams(scenes, store, growing, 2, (0, 2))[9]
     assert torch.equal(again.features[0].levels[0], steps[9].features[0].levels[0])
     assert torch.equal(again.fresh, steps[9].fresh)
-    two = [Streams(scenes, store, StreamSettings(1, 2, 6, 4), exact, (0, 2), rank, 2)[9] for rank in range(2)]
+    two = [Streams(scenes, store, growing, 1, (0, 2), rank, 2)[9] for rank in range(2)]
     both = torch.cat([each.features[1].levels[0] for each in two])
     assert torch.equal(both, steps[9].features[1].levels[0])

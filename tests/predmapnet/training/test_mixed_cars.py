@@ -11,14 +11,14 @@ from tiny_clips import tiny_paper_config
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.batches import Batch
-from predmapnet.training.data.calibration_noise import CalibrationNoise
-from predmapnet.training.data.draws import Clips, TrainingScenes, step_loader
+from predmapnet.training.data.draws import Clips, step_loader
 from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.loop import Trainer
-from predmapnet.training.settings import StreamSettings, choose_stages
+from predmapnet.training.settings import choose_stages
 from tests.predmapnet.training.small_runs import (
     OFTEN,
     drawn,
@@ -33,7 +33,7 @@ from tests.predmapnet.training.small_runs import (
 UNCHANGED = AugmentationSettings(
     photography=PhotographySettings(**dict.fromkeys(PhotographySettings.__dataclass_fields__, 0.0)),
     camera_dropout=0.0,
-    calibration=CalibrationNoise(probability=0.0),
+    bumped=0.0,
 )
 
 
@@ -89,7 +89,7 @@ def test_every_stage_trains_on_cars_of_different_rigs(name, tmp_path):
     torch.manual_seed(0)
     config = tiny_config() if name in ("single", "temporal") else tiny_paper_config()
     scenes, network = mixed_scenes(tmp_path, config), PredMapNet(config)
-    stage = replace(choose_stages(config, name)[0], streams=StreamSettings(growth_steps=1, longest=6))
+    stage = replace(choose_stages(config, name)[0], growth_steps=1, longest=6)
     planned = planned_for(short_clips(stage), steps=2, batch=3)
     trainer = Trainer(one_process(), network, tmp_path / "run", OFTEN, quiet)
     assert trainer.run(planned, drawn(planned, network, scenes, tmp_path), nothing_measured)

@@ -21,7 +21,7 @@ def test_losses_and_noise(name):
     assert losses.depth == 3.0, "MapTRv2"
     assert (losses.focal, losses.points / 2, losses.transformation) == (5.0, 50.0, 0.1), "MapTracker"
     assert (losses.segmentation, losses.segmentation_dice) == (100.0, 1.0), "MapTracker"
-    assert (stage.clips.frames, stage.clips.span, stage.tracks.score) == (5, 10, 0.4), "MapTracker"
+    assert (stage.frames, stage.span, stage.tracks.score) == (5, 10, 0.4), "MapTracker"
     assert (stage.angle_noise, stage.distance_noise) == (0.08, 0.25), "MapTracker"
     assert (stage.augmentation.grid_mask, stage.augmentation.mirror) == (0.7, 0.0), "MapTracker"
 

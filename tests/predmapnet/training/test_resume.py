@@ -8,13 +8,13 @@ import torch
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
+from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.prepare import DataOptions, DataSet
 from predmapnet.training.loop import Trainer
 from predmapnet.training.plan import PlanOptions
 from predmapnet.training.run import RunOptions, train_network
-from predmapnet.training.settings import LITE_STAGES, StreamSettings
+from predmapnet.training.settings import LITE_STAGES
 from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
 from tests.predmapnet.training.paper_clips import JOINT, PlainBackbone
 from tests.predmapnet.training.small_runs import (
@@ -40,7 +40,8 @@ STAGES = {
     "temporal": replace(
         TEMPORAL,
         tracks=replace(TEMPORAL.tracks, score=0.03),
-        streams=StreamSettings(growth_steps=1, longest=6),
+        growth_steps=1,
+        longest=6,
     ),
     "joint": short_clips(JOINT),
 }

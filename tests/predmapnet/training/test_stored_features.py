@@ -8,11 +8,11 @@ import torch
 
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
-from predmapnet.frame_cache.scene_cache import CachedScene, frame_path, read_arrays, write_arrays
+from predmapnet.frame_cache.prepare import DataOptions, DataSet
+from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes, frame_path, read_arrays, write_arrays
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import collate_frames
-from predmapnet.training.data.draws import TrainingScenes
-from predmapnet.training.data.prepare import DataOptions, DataSet
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlanOptions
@@ -40,7 +40,7 @@ def some_network(seed=0, config=CONFIG):
 
 @torch.no_grad()
 def encoded(network, scenes, scene, frame, mirrored):
-    inputs = collate_frames([scenes.load(scene, frame, mirrored)], network.config).inputs(network)
+    inputs = collate_frames([load_frame(scenes, scene, frame, mirrored)], network.config).inputs(network)
     return network.encode_bev(network.encode_images(inputs), inputs)
 
 

@@ -17,20 +17,20 @@ from predmapnet.datasets.splits import split_names
 from predmapnet.demo_world.rigs import sample_rig
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.fill_cache import expected_bytes
-from predmapnet.frame_cache.scene_cache import INDEX, CachedScene
-from predmapnet.network.calibration import calibrate
-from predmapnet.network.image_input import stack_windows
-from predmapnet.presets import preset
-from predmapnet.scenes import SceneInfo
-from predmapnet.training.data.prepare import (
+from predmapnet.frame_cache.prepare import (
     DataOptions,
     DataSet,
-    _names,
+    _split,
     cache_folder,
     count_frames,
     parse_data_sets,
     prepare_data,
 )
+from predmapnet.frame_cache.scene_cache import INDEX, CachedScene
+from predmapnet.network.calibration import calibrate
+from predmapnet.network.image_input import stack_windows
+from predmapnet.presets import preset
+from predmapnet.scenes import SceneInfo
 from tests.predmapnet.datasets.conftest import write_nuscenes
 
 CONFIG = preset("lite")
@@ -151,7 +151,7 @@ def test_missing_and_broken_images_mask_their_cameras_and_the_frame_stays(town, 
 def test_a_killed_filling_goes_on(town, tmp_path):
     code = (
         "import sys, time; from pathlib import Path; from predmapnet.frame_cache import fill_cache\n"
-        "from predmapnet.training.data.prepare import DataOptions, DataSet, prepare_data\n"
+        "from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data\n"
         "from predmapnet.presets import preset\n"
         "write = fill_cache.write_arrays\n"
         "fill_cache.write_arrays = lambda *a: (write(*a), print('made', flush=True), time.sleep(1.0))\n"
@@ -211,7 +211,7 @@ def test_weights_of_data_sets_are_those_of_their_scenes(town, tmp_path):
 def test_logs_that_published_training_leaves_out_are_left_out():
     left_out = split_names("argoverse2_skipped")[0]
     infos = [SceneInfo(name, "train", 3, "PIT") for name in (left_out, "another")]
-    assert _names(infos, 10) == (["another"], [])
+    assert _split(infos, 10) == (infos[1:], [])
 
 
 def test_codes_of_cameras_have_caches_of_their_own_and_other_networks_share_one():

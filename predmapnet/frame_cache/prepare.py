@@ -16,10 +16,9 @@ from predmapnet.demo_world.source import DEMO
 from predmapnet.demo_world.training_drive import training_rig
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.fill_cache import fill_from_source, fill_with_demo
-from predmapnet.frame_cache.scene_cache import INDEX, CachedScene, cache_folder
-from predmapnet.scenes import Report, SceneInfo
+from predmapnet.frame_cache.scene_cache import INDEX, CachedScene, TrainingScenes, cache_folder
+from predmapnet.scenes import Report, SceneInfo, SceneSource
 from predmapnet.sources import DATASETS, open_source
-from predmapnet.training.data.draws import TrainingScenes
 
 PreparedData = tuple[TrainingScenes, list[CachedScene]]
 """Scenes that are trained on, and those that are validated on."""
@@ -105,31 +104,22 @@ def prepare_data(
     train: dict[Path, float] = {}
     validation: list[Path] = []
     for chosen in options.sets:
-        folder, learned, measured = _prepare(chosen, options, config, processes, report)
+        source, sentence, *parts = _chosen_scenes(chosen, options)
+        learned, measured = ([info.name for info in part] for part in parts)
+        if source is None:
+            folder = cache_folder(options.cache, f"{DEMO}-v{WORLD_VERSION}", config)
+            fill_with_demo(folder, learned + measured, config, processes, report)
+        else:
+            place = sha256(str(source.root.resolve()).encode()).hexdigest()[:8]
+            folder = cache_folder(options.cache, f"{source.name}-{place}", config)
+            report(f"{sentence} {len(learned)} scenes to train on, {len(measured)} to validate on.")
+            fill_from_source(source, learned + measured, folder, config, processes, report)
         train |= {folder / name: chosen.weight for name in learned if (folder / name / INDEX).exists()}
         validation += [folder / name for name in measured if (folder / name / INDEX).exists()]
     if not train:
         raise UserError(f"There is no scene to train on in {options}.")
     scenes = TrainingScenes([CachedScene(folder) for folder in train], list(train.values()), config)
     return scenes, [CachedScene(folder) for folder in validation]
-
-
-def _prepare(
-    chosen: DataSet, options: DataOptions, config: PredMapNetConfig, processes: int, report: Report
-) -> tuple[Path, list[str], list[str]]:
-    """Fill the cache of one data set; return its folder, and names of training and validation scenes."""
-    if chosen.name == DEMO:
-        folder = cache_folder(options.cache, f"{DEMO}-v{WORLD_VERSION}", config)
-        learned, measured = _demo_names("train", options.towns), _demo_names("val", options.validation)
-        fill_with_demo(folder, learned + measured, config, processes, report)
-        return folder, learned, measured
-    source, sentence = open_source(chosen.name, chosen.root, options.split_scheme)
-    place = sha256(str(source.root.resolve()).encode()).hexdigest()[:8]
-    folder = cache_folder(options.cache, f"{source.name}-{place}", config)
-    learned, measured = _names(source.scenes(), options.validation)
-    report(f"{sentence} {len(learned)} scenes to train on, {len(measured)} to validate on.")
-    fill_from_source(source, learned + measured, folder, config, processes, report)
-    return folder, learned, measured
 
 
 def count_frames(options: DataOptions, config: PredMapNetConfig) -> tuple[int, int]:
@@ -140,37 +130,42 @@ def count_frames(options: DataOptions, config: PredMapNetConfig) -> tuple[int, i
     """
     total, images, any_car = 0.0, 0, isinstance(config.bev, LookupBevConfig)
     for chosen in options.sets:
-        if chosen.name == DEMO:
-            infos = (*scene_infos("train"), *scene_infos("val"))
-            learned, measured = _demo_names("train", options.towns), _demo_names("val", options.validation)
-            cameras = [len(training_rig(name, any_car)) for name in learned + measured]
+        source, _, learned, measured = _chosen_scenes(chosen, options)
+        infos = learned + measured
+        if source is None:
+            cameras = [len(training_rig(info.name, any_car)) for info in infos]
         else:
-            source, _ = open_source(chosen.name, chosen.root, options.split_scheme)
-            infos = tuple(source.scenes())
-            learned, measured = _names(infos, options.validation)
-            cameras = [len(source.open(name).rig) for name in (learned + measured)[:1]] * len(learned + measured)
-        frames = {info.name: info.frames for info in infos}
-        total += chosen.weight * sum(frames[name] for name in learned)
-        images += sum(frames[name] * count for name, count in zip(learned + measured, cameras, strict=True))
+            cameras = [len(source.open(info.name).rig) for info in infos[:1]] * len(infos)
+        total += chosen.weight * sum(info.frames for info in learned)
+        images += sum(info.frames * count for info, count in zip(infos, cameras, strict=True))
     return round(total), images
 
 
-def _demo_names(split: str, count: int) -> list[str]:
-    names = [info.name for info in scene_infos(split)]
-    if count > len(names):
-        raise UserError(f"The demo world has {len(names)} {split} scenes, not {count}.")
-    return names[:count]
+def _chosen_scenes(
+    chosen: DataSet, options: DataOptions
+) -> tuple[SceneSource | None, str, list[SceneInfo], list[SceneInfo]]:
+    """Open a data set (None: towns, which are drawn), with a sentence for users; scenes to learn and to validate."""
+    if chosen.name == DEMO:
+        return None, "", _towns("train", options.towns), _towns("val", options.validation)
+    source, sentence = open_source(chosen.name, chosen.root, options.split_scheme)
+    return source, sentence, *_split(source.scenes(), options.validation)
 
 
-def _names(infos: Sequence[SceneInfo], validation: int) -> tuple[list[str], list[str]]:
-    """Names of training and validation scenes; logs that no split knows are trained on, all of them."""
+def _towns(split: str, count: int) -> list[SceneInfo]:
+    infos = scene_infos(split)
+    if count > len(infos):
+        raise UserError(f"The demo world has {len(infos)} {split} scenes, not {count}.")
+    return list(infos[:count])
+
+
+def _split(infos: Sequence[SceneInfo], validation: int) -> tuple[list[SceneInfo], list[SceneInfo]]:
+    """Scenes to train on and to validate on; logs that no split knows are trained on, all of them."""
     skipped = {*split_names("nuscenes_skipped"), *split_names("argoverse2_skipped")}
-    by_split = {
-        split: [info.name for info in infos if info.split == split and info.name not in skipped]
+    train, measured, others = (
+        [info for info in infos if info.split == split and info.name not in skipped]
         for split in ("train", "val", "test")
-    }
-    measured = by_split["val"]
+    )
+    if not train and not measured:
+        return others, []
     spread = np.unique(np.linspace(0, len(measured) - 1, min(validation, len(measured))).round().astype(int))
-    if not by_split["train"] and not measured:
-        return by_split["test"], []
-    return by_split["train"], [measured[index] for index in spread]
+    return train, [measured[index] for index in spread]
