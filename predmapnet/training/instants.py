@@ -117,8 +117,8 @@ class StageTraining(nn.Module):
             if weights.transformation and seen is not None and past.chosen is not None and past.truth is not None:
                 self._add_transformation(sums, past.state, seen, past.chosen, past.truth, inputs)
             exclusive = network.config.decoder.query_assignment == "suppress"
-            matched = match(outputs, truth, past.owners, weights, exclusive, self._unit)
-            add_layers(sums, outputs, truth, matched, past.owners.kinds.shape[1], weights, self._unit)
+            matched = match(outputs, truth, past.owners, weights, exclusive)
+            add_layers(sums, outputs, truth, matched, past.owners.kinds.shape[1], weights)
             if past.state is None:
                 continue
             past = self._next(past, outputs, matched, truth, inputs, draws)

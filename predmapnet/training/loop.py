@@ -31,6 +31,7 @@ from predmapnet.training.instants import StageTraining
 from predmapnet.training.metrics import Meter, MetricsLog
 from predmapnet.training.optimiser import WeightAverage, learning_rate, make_optimiser
 from predmapnet.training.plan import PlannedStage
+from predmapnet.training.processes import gathered
 from predmapnet.training.run_checkpoint import Position, below_prefix, with_prefix
 from predmapnet.training.settings import Stage
 from predmapnet.training.stage_data import StageData
@@ -238,17 +239,10 @@ class Trainer:
             values /= size
         return values
 
-    def _gathered(self, own: list[str]) -> list[str]:
-        """Return what all processes say."""
-        everyone = [own] * self._fabric.world_size
-        if self._fabric.world_size > 1:
-            distributed.all_gather_object(everyone, own)
-        return [said for each in everyone for said in each]
-
     def _tell_of(self, training: StageTraining, terms: dict[str, Tensor], names: list[str], bad: int) -> None:
         """Name the frames of a step that could not be taken. Raises UserError if it is one of many in a row."""
         training.carried = None  # What streams remember may be broken as well.
-        seen = ", ".join(self._gathered(names))
+        seen = ", ".join(name for said in gathered(names) for name in said)
         losses = ", ".join(f"{name} {float(term):.3g}" for name, term in terms.items())
         where = f"step {self.position.step} of stage {self.position.stage}"
         self._report(f"Skipped {where}, whose gradient is not finite. Losses: {losses}. It saw: {seen}.")

@@ -64,6 +64,15 @@ def check_devices(device: str, devices: int) -> None:
         raise UserError(f"This torch sees {found} GPUs here, not {devices}. Give --device cpu, or fewer --devices.")
 
 
+def gathered(own: Result) -> list[Result]:
+    """Return what each of all processes has, in their order."""
+    if not distributed.is_initialized():
+        return [own]
+    everyone = [own] * distributed.get_world_size()
+    distributed.all_gather_object(everyone, own)
+    return everyone
+
+
 def in_processes(devices: int, device: str, body: Callable[..., Result], *arguments: object) -> Result:
     """Run ``body(fabric, *arguments)`` in a process for each device; this one is the first, and its result counts."""
     if devices == 1 or by_torchrun():

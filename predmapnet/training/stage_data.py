@@ -6,8 +6,6 @@ from collections.abc import Iterator
 from itertools import count
 from zlib import crc32
 
-import torch
-
 from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.training.data.batches import StreamSegment
 from predmapnet.training.data.draws import CROSSING_WEIGHT, Clips, step_loader
@@ -42,9 +40,7 @@ class StageData:
         """Yield them without an end, from number ``first`` on."""
         if isinstance(self._drawn, Streams):
             return map(self._drawn.__getitem__, count(first))
-        # The loader draws a seed for its workers, which must not come out of those of dropout.
-        with torch.random.fork_rng(devices=()):
-            return iter(step_loader(self._drawn, self._batch, first, *self._place, self._workers))
+        return iter(step_loader(self._drawn, self._batch, first, *self._place, self._workers))
 
     def name(self, number: int) -> str:
         """Say which frames a segment holds."""

@@ -17,6 +17,7 @@ from predmapnet.machine import Precision
 from predmapnet.mapper import to_frame_map
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.training.data.batches import collate_frames
+from predmapnet.training.processes import gathered
 
 EVERY = 4
 """Every fourth frame is measured: neighbours look alike."""
@@ -38,16 +39,11 @@ def validate(network: PredMapNet, scenes: Sequence[CachedScene], streaming: bool
         ``mAP`` and per kind the AP averaged over thresholds, and at each threshold, all in [0, 1]; ``C-mAP`` of all
         frames of streams.
     """
-    alone = not distributed.is_initialized()
-    rank, size = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
-    own = [_mapped(network, scene, streaming) for scene in scenes[rank::size]]
-    everyone = [own] * size
-    if not alone:
-        distributed.all_gather_object(everyone, own)
+    rank, size = (distributed.get_rank(), distributed.get_world_size()) if distributed.is_initialized() else (0, 1)
+    everyone = gathered([_mapped(network, scene, streaming) for scene in scenes[rank::size]])
     # In the order of the scenes: first the first of each process, and so on.
-    mapped = [everyone[number % size][number // size] for number in range(len(scenes))]
+    frames = [frame for number in range(len(scenes)) for frame in everyone[number % size][number // size]]
     thresholds = thresholds_for(network.config.roi)
-    frames = [frame for scene in mapped for frame in scene]
     measured = [frame for frame in frames if frame.index % EVERY == FIRST]
     result = chamfer_average_precision(measured, thresholds)
     figures = {"mAP": result.mean}

@@ -51,18 +51,9 @@ class LossSums:
 
 
 def add_layers(
-    sums: LossSums,
-    outputs: FrameOutputs,
-    truth: Truth,
-    matched: Matched,
-    tracks: int,
-    weights: LossWeights,
-    unit: Tensor,
+    sums: LossSums, outputs: FrameOutputs, truth: Truth, matched: Matched, tracks: int, weights: LossWeights
 ) -> None:
-    """Add the losses of classes, lines and masks of all layers (L_track and L_seg).
-
-    ``tracks`` is the number of track rows; ``unit`` as for :class:`~predmapnet.training.losses.matching.Truth`.
-    """
+    """Add the losses of classes, lines and masks of all layers (L_track and L_seg); ``tracks`` rows are tracks."""
     for layer, pairs in zip(outputs.layers, matched.layers, strict=True):
         kinds = truth.targets.kinds[pairs.truth]
         if layer.logits is not None:
@@ -71,7 +62,7 @@ def add_layers(
             focal = (focal_loss(layer.logits, wanted) * outputs.query_valid[..., None]).sum()
             sums.add("focal", weights.focal * focal, len(pairs))
         if layer.points is not None:
-            points = layer.points[pairs.frame, pairs.row] * unit
+            points = layer.points[pairs.frame, pairs.row] * truth.unit
             rings = kinds == ElementKind.PED_CROSSING
             target = best_order(points, truth.points[pairs.truth], rings, weights.cost_beta)
             apart = functional.smooth_l1_loss(points, target, reduction="sum", beta=weights.beta)

@@ -52,11 +52,13 @@ class Truth:
         kinds, element_ids: ``(M,)``, on the host.
         begin: ``(B + 1,)``, on the host: pieces ``begin[b]`` to ``begin[b + 1]`` are those of stream b.
         pieces: ``(B, G) int64``, on the device: the pieces of each stream; anything in padding.
-        points: ``(M, P, 2)``, in the unit of the losses.
+        unit: ``(2,)``, what one stands for, in the unit of the losses.
+        points: ``(M, P, 2)``, in that unit.
     """
 
     def __init__(self, targets: Targets, device: torch.device, unit: Tensor) -> None:
-        """Take targets that are on the host; ``unit`` ``(2,)`` is what one stands for, in the unit of the losses."""
+        """Take targets that are on the host."""
+        self.unit = unit
         self.kinds, self.element_ids = targets.kinds.numpy(), targets.element_ids.numpy()
         counts = np.bincount(targets.frame.numpy(), minlength=targets.batch)
         self.begin = np.concatenate([[0], np.cumsum(counts)])
@@ -180,9 +182,7 @@ class Matched:
 
 
 @torch.no_grad()
-def match(
-    outputs: FrameOutputs, truth: Truth, owners: TrackTruth, weights: LossWeights, exclusive: bool, unit: Tensor
-) -> Matched:
+def match(outputs: FrameOutputs, truth: Truth, owners: TrackTruth, weights: LossWeights, exclusive: bool) -> Matched:
     """Assign the rows of every layer to the truth of their stream.
 
     A track answers for the piece that it stands for already, or for background if that is gone. Detections share out
@@ -195,15 +195,14 @@ def match(
         weights: of the costs.
         exclusive: detections do not see the truth that tracks answer for (``suppress``), and no two tracks answer for
             one piece.
-        unit: ``(2,)``, as for :class:`Truth`.
     """
     orders, tracks = truth.orders(), owners.kinds.shape[1]
     deciding = [layer for layer in outputs.layers if layer.logits is not None]
     last = deciding[-1]
     assert last.logits is not None and last.points is not None and last is outputs.layers[-1]
-    distance = line_costs((last.points[:, :tracks] * unit).flatten(2), *orders, 0.0)
+    distance = line_costs((last.points[:, :tracks] * truth.unit).flatten(2), *orders, 0.0)
     scores = last.logits.sigmoid().amax(dim=2)
-    costs = [_layer_costs(layer, truth, orders, weights, unit) for layer in deciding]
+    costs = [_layer_costs(layer, truth, orders, weights) for layer in deciding]
     on_host = _to_host([*costs, distance, scores, outputs.query_valid])
     apart, score, valid = on_host[-3], on_host[-2], on_host[-1] > 0
     pairs: list[list[Integer]] = [[] for _ in deciding]
@@ -238,7 +237,7 @@ def assign(cost: Float32, rows: Integer, pieces: Integer) -> tuple[Integer, Inte
 
 
 def _layer_costs(
-    layer: LayerPredictions, truth: Truth, orders: tuple[Tensor, Tensor, int], weights: LossWeights, unit: Tensor
+    layer: LayerPredictions, truth: Truth, orders: tuple[Tensor, Tensor, int], weights: LossWeights
 ) -> Tensor:
     """Costs ``(B, R, G)`` of one layer; anything in padding."""
     assert layer.logits is not None
@@ -246,7 +245,9 @@ def _layer_costs(
     of_class = focal_class_cost(layer.logits)
     cost = weights.cost_focal * of_class.gather(2, kinds[:, None].expand(-1, of_class.shape[1], -1))
     if layer.points is not None:
-        return cost + weights.cost_points * line_costs((layer.points * unit).flatten(2), *orders, weights.cost_beta)
+        return cost + weights.cost_points * line_costs(
+            (layer.points * truth.unit).flatten(2), *orders, weights.cost_beta
+        )
     if layer.masks is not None and len(truth.kinds):
         return cost + weights.cost_mask * mask_cost(layer.masks, truth.masks_like(layer.masks)[truth.pieces])
     return cost

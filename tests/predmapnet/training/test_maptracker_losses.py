@@ -88,14 +88,14 @@ def test_assignment_and_losses_of_a_layer(given, expected, case):
         bev=torch.zeros(1, 0, 1, 1),
         ego_to_global=torch.eye(4, dtype=torch.float64)[None],
     )
-    matched = match(outputs, truth, owners, PAPER_LOSSES, exclusive=True, unit=torch.ones(2))
+    matched = match(outputs, truth, owners, PAPER_LOSSES, exclusive=True)
     pairs = matched.layers[-1]
     assert torch.equal(pairs.row, expected[f"{case}/pos_query"])
     assert torch.equal(pairs.truth, expected[f"{case}/pos_gt"])
     labels = torch.full((count,), 3).scatter(0, pairs.row, given["gt_labels"][pairs.truth])
     assert torch.equal(labels, expected[f"{case}/target_labels"])
     sums = LossSums()
-    add_layers(sums, outputs, truth, matched, owners.kinds.shape[1], PAPER_LOSSES, torch.ones(2))
+    add_layers(sums, outputs, truth, matched, owners.kinds.shape[1], PAPER_LOSSES)
     terms = sums.means(lambda counts: counts)
     close(terms["focal"], expected[f"{case}/loss_cls"])
     close(terms["points"], expected[f"{case}/loss_reg"])

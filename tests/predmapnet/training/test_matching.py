@@ -56,7 +56,7 @@ def pairs_of(
         bev=torch.zeros(streams, 0, 10, 20),
         ego_to_global=torch.eye(4, dtype=torch.float64).repeat(streams, 1, 1),
     )
-    return match(outputs, truth, owners or TrackTruth.none(streams), LITE_LOSSES, exclusive, SIZE).layers[0]
+    return match(outputs, truth, owners or TrackTruth.none(streams), LITE_LOSSES, exclusive).layers[0]
 
 
 def plain_curve_cost(points: np.ndarray, target: np.ndarray, ring: bool) -> float:

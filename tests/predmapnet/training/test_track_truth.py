@@ -54,7 +54,7 @@ def matched(
     outputs: FrameOutputs, targets: Targets, owners: TrackTruth, exclusive: bool = False
 ) -> tuple[Matched, Truth]:
     truth = Truth(targets, torch.device("cpu"), SIZE)
-    return match(outputs, truth, owners, LITE_LOSSES, exclusive, SIZE), truth
+    return match(outputs, truth, owners, LITE_LOSSES, exclusive), truth
 
 
 def pairs(
@@ -94,7 +94,7 @@ def test_a_track_without_owner_is_pushed_towards_background() -> None:
     logits.requires_grad_(True)
     found, truth = matched(outputs, targets, owners_of(77))
     sums = LossSums()
-    add_layers(sums, outputs, truth, found, 1, LITE_LOSSES, SIZE)
+    add_layers(sums, outputs, truth, found, 1, LITE_LOSSES)
     sums.means(lambda counts: counts)["focal"].backward()
     assert logits.grad is not None
     assert logits.grad[0, 0, 1] > 0 > logits.grad[0, 1, 1]
