@@ -87,7 +87,7 @@ def train(
     from predmapnet.demo_world.catalogue import default_cache
     from predmapnet.frame_cache.prepare import DataOptions, parse_data_sets
     from predmapnet.presets import load_config
-    from predmapnet.training import run
+    from predmapnet.runs import train as run
     from predmapnet.training.loop import LoopSettings
     from predmapnet.training.plan import PlanOptions
     from predmapnet.training.processes import leads, usual_devices

@@ -27,10 +27,10 @@ from predmapnet.files import check_output, write_file
 from predmapnet.frame_cache.prepare import DataOptions, parse_data_sets, prepare_data
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
+from predmapnet.runs.train import WEIGHTS, RunOptions, train_network
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlanOptions
 from predmapnet.training.processes import usual_devices
-from predmapnet.training.run import WEIGHTS, RunOptions, train_network
 from predmapnet.training.run_checkpoint import latest
 from predmapnet.training.validation import validate
 from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint

@@ -36,10 +36,10 @@ from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data
 from predmapnet.frame_cache.scene_cache import CachedScene
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
+from predmapnet.runs.train import RunOptions, train_network
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
-from predmapnet.training.run import RunOptions, train_network
 from predmapnet.training.settings import LITE_STAGES, NUSCENES_STAGES
 from predmapnet.training.validation import map_frames
 from predmapnet.weights.checkpoint import load_checkpoint

@@ -10,13 +10,13 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.frame_cache.depth_targets import UNKNOWN
 from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.runs.train import RunOptions, export, run_stages
 from predmapnet.training import run_checkpoint
 from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.draws import Clips, step_loader
 from predmapnet.training.loop import BEST
 from predmapnet.training.optimiser import make_optimiser
 from predmapnet.training.plan import PlanOptions
-from predmapnet.training.run import RunOptions, export, run_stages
 from predmapnet.training.settings import BEV_PARTS, NUSCENES_STAGES
 from predmapnet.weights.checkpoint import load_checkpoint
 from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config

@@ -10,10 +10,10 @@ from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.runs.train import RunOptions, train_network
 from predmapnet.training import run_checkpoint
 from predmapnet.training.loop import Trainer
 from predmapnet.training.plan import PlanOptions
-from predmapnet.training.run import RunOptions, train_network
 from predmapnet.training.settings import LITE_STAGES
 from tests.predmapnet.training.painted_scenes import painted_scenes, tiny_config
 from tests.predmapnet.training.paper_clips import JOINT, PlainBackbone

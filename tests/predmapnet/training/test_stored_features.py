@@ -11,12 +11,12 @@ from predmapnet.errors import UserError
 from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes, frame_path, read_arrays, write_arrays
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.runs.train import RunOptions, run_stages
 from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings
 from predmapnet.training.plan import PlanOptions
-from predmapnet.training.run import RunOptions, run_stages
 from tests.predmapnet.training.painted_scenes import painted_scene, tiny_config
 from tests.predmapnet.training.small_runs import one_process, quiet
 

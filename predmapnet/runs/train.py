@@ -14,9 +14,9 @@ from predmapnet.errors import UserError
 from predmapnet.frame_cache.fill_cache import expected_bytes
 from predmapnet.frame_cache.prepare import DataOptions, PreparedData, count_frames, prepare_data
 from predmapnet.network.predmapnet import PredMapNet
+from predmapnet.runs.train_plan import plan_table
 from predmapnet.scenes import Report
 from predmapnet.training import run_checkpoint
-from predmapnet.training.dry_run import plan_table
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
