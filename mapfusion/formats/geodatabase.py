@@ -37,7 +37,7 @@ LINES, CROSSINGS, OBSERVED = "lines", "crossings", "observed"
 LISTS = ("track_ids", "deviation_m", "sources", "source_track_ids")
 TIMES, REST = ("first_seen", "last_seen"), "_rest_ns"
 SPECIAL = re.compile(r"[!;?\x00-\x1f\ud800-\udfff]|^\w\w+:")
-"""What pyogrio cuts names at, GDAL drops from them, UTF-8 does not have, or names a driver in place of a file."""
+"""Parts of names that pyogrio cuts at, GDAL drops, UTF-8 lacks, or that name a driver in place of a file."""
 FLAT = "FlatGeobuf"
 """Driver whose layers of lines and areas together have no heights."""
 METADATA = "predmapnet"

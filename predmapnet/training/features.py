@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from predmapnet.augmentation.frames import load_frame
 from predmapnet.config import LookupBevConfig
 from predmapnet.errors import UserError
 from predmapnet.files import write_file
@@ -17,7 +18,6 @@ from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures
 from predmapnet.scenes import Report
-from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import collate_frames
 
 ENCODERS = ("image_backbone", "bev_encoder")

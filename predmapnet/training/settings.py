@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from predmapnet.augmentation.frames import AugmentationSettings
 from predmapnet.config import BevFormerConfig, MapTrackerDecoderConfig, PredMapNetConfig
 from predmapnet.datasets.argoverse2_files import ARGOVERSE2_CAMERAS
 from predmapnet.errors import UserError
-from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.losses.weights import LITE_LOSSES, PAPER_LOSSES, LossWeights
 
 

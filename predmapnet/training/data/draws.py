@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader, Dataset
 
 from mapfusion.arrays import Float
+from predmapnet.augmentation.frames import AugmentationSettings, augment, load_frame
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
 from predmapnet.machine import begin_loading
-from predmapnet.training.data.augmentation import AugmentationSettings, augment, load_frame
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 
 CROSSING_WEIGHT = 2.5

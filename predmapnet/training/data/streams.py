@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from predmapnet.augmentation.frames import disturb_pose, load_frame
 from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
 from predmapnet.network.calibration import Calibration
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.augmentation import disturb_pose, load_frame
 from predmapnet.training.data.batches import StreamSegment, collate_frames
 from predmapnet.training.data.draws import EpochOrder
 from predmapnet.training.data.targets import truth_targets

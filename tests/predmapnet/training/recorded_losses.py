@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from predmapnet.augmentation.frames import load_frame
 from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.network.calibration import Calibration, collate_calibrations
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import Batch, StreamSegment
 from predmapnet.training.data.targets import truth_targets
 from predmapnet.training.instants import StageTraining

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from predmapnet.augmentation.frames import AugmentationSettings
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.frame_cache.depth_targets import UNKNOWN
 from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.runs.train import RunOptions, export, run_stages
 from predmapnet.training import run_checkpoint
-from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.draws import Clips, step_loader
 from predmapnet.training.loop import BEST
 from predmapnet.training.optimiser import make_optimiser

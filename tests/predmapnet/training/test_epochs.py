@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from predmapnet.augmentation.frames import AugmentationSettings, load_frame
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes
 from predmapnet.network.state import BevFeatures
-from predmapnet.training.data.augmentation import AugmentationSettings, load_frame
 from predmapnet.training.data.draws import PARTS_OF_WEIGHTS, Clips, EpochOrder, step_loader
 from predmapnet.training.data.streams import Streams
 from predmapnet.training.data.targets import truth_targets

@@ -9,14 +9,14 @@ import torch
 from painted_scenes import painted_scenes, tiny_config
 from tiny_clips import tiny_paper_config
 
+from predmapnet.augmentation.frames import AugmentationSettings
+from predmapnet.augmentation.photography import PhotographySettings
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.frame_cache.scene_cache import TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.training.data.augmentation import AugmentationSettings
 from predmapnet.training.data.batches import Batch
 from predmapnet.training.data.draws import Clips, step_loader
-from predmapnet.training.data.photography import PhotographySettings
 from predmapnet.training.loop import Trainer
 from predmapnet.training.settings import choose_stages
 from tests.predmapnet.training.small_runs import (

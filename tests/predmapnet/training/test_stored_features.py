@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from predmapnet.augmentation.frames import load_frame
 from predmapnet.config import PredMapNetConfig
 from predmapnet.errors import UserError
 from predmapnet.frame_cache.prepare import DataOptions, DataSet
 from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes, frame_path, read_arrays, write_arrays
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.runs.train import RunOptions, run_stages
-from predmapnet.training.data.augmentation import load_frame
 from predmapnet.training.data.batches import collate_frames
 from predmapnet.training.features import fill_features
 from predmapnet.training.loop import LoopSettings

@@ -10,11 +10,8 @@ import numpy as np
 import torch
 
 from mapfusion.arrays import Bool, Byte, Float
-from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
-from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
-from predmapnet.network.image_input import input_size
-from predmapnet.training.data.calibration_noise import perturb_calibration
-from predmapnet.training.data.photography import (
+from predmapnet.augmentation.calibration_noise import perturb_calibration
+from predmapnet.augmentation.photography import (
     PhotographySettings,
     add_noise,
     add_stray_light,
@@ -22,6 +19,9 @@ from predmapnet.training.data.photography import (
     save_and_load,
     tone_tables,
 )
+from predmapnet.config import BevFormerConfig, ImageConfig, PredMapNetConfig
+from predmapnet.frame_cache.scene_cache import CachedFrame, TrainingScenes
+from predmapnet.network.image_input import input_size
 
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Ego frame to mirrored ego frame; its own inverse."""

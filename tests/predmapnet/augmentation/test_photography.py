@@ -7,8 +7,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from predmapnet.training.data.augmentation import AugmentationSettings, change_light
-from predmapnet.training.data.photography import PhotographySettings, tone_tables
+from predmapnet.augmentation.frames import AugmentationSettings, change_light
+from predmapnet.augmentation.photography import PhotographySettings, tone_tables
 
 NOTHING = PhotographySettings(**{field.name: 0.0 for field in fields(PhotographySettings)})
 

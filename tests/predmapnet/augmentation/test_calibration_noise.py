@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
+from predmapnet.augmentation.calibration_noise import perturb_calibration
 from predmapnet.demo_world.rig import DEMO_RIG
 from predmapnet.network.calibration import calibrate
 from predmapnet.presets import preset
-from predmapnet.training.data.calibration_noise import perturb_calibration
 
 TRUE = calibrate(DEMO_RIG, preset("lite"))
 ALWAYS = 1.0

@@ -7,12 +7,7 @@ import pytest
 import torch
 
 from mapfusion.geometry import inverse_pose, transform_points
-from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.frame_cache.scene_cache import CachedFrame
-from predmapnet.network.calibration import calibrate
-from predmapnet.presets import preset
-from predmapnet.scenes import FrameTruth
-from predmapnet.training.data.augmentation import (
+from predmapnet.augmentation.frames import (
     AugmentationSettings,
     augment,
     cover_grid,
@@ -20,7 +15,12 @@ from predmapnet.training.data.augmentation import (
     drop_camera,
     mirror,
 )
-from predmapnet.training.data.photography import PhotographySettings
+from predmapnet.augmentation.photography import PhotographySettings
+from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.frame_cache.scene_cache import CachedFrame
+from predmapnet.network.calibration import calibrate
+from predmapnet.presets import preset
+from predmapnet.scenes import FrameTruth
 from tests.predmapnet.network.mirrored_rig import mirror_rig
 
 LITE, PAPER = preset("lite"), preset("paper-nuscenes")

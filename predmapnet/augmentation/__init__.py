@@ -1,0 +1,1 @@
+"""Changes to the frames of a training that keep their truth exact: photography, mirroring, lost and wrong cameras."""
