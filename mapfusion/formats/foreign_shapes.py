@@ -80,9 +80,8 @@ def _parts(geometry: Any, feature: int, notes: ReadingNotes) -> Iterator[tuple[s
     """Yield the LineStrings and Polygons of a geometry with their coordinates."""
     if not isinstance(geometry, Mapping):
         raise ValueError(f"its geometry is not an object but {str(geometry)[:40]!r}")
-    name, coordinates = geometry.get("type"), geometry.get("coordinates")
-    if name == "GeometryCollection":
-        coordinates = geometry.get("geometries")
+    name = geometry.get("type")
+    coordinates: Any = geometry.get("geometries" if name == "GeometryCollection" else "coordinates")
     if str(name).startswith(("Geometry", "Multi")) and not coordinates:
         notes.add("an empty geometry: left out", feature)
     elif name == "GeometryCollection":
