@@ -3,7 +3,6 @@
 ``drives``
     One run of ``lite`` over data that are as different as they get: two demo towns with different cars, an Argoverse 2
     log in its own layout with its seven cameras (drawn by the renderer), and the real street, read as anybody's log.
-    It begins with the shipped weights, but for the forecast, which knows all it can and begins anew.
 ``frame``
     ``lite``, from the shipped weights and without augmentation, on a single frame of the real street, until it knows it
     by heart: chamfer AP at 1.5 m of the classes in the frame.
@@ -43,9 +42,8 @@ from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
 from predmapnet.training.settings import LITE_STAGES, NUSCENES_STAGES
 from predmapnet.training.validation import map_frames
-from predmapnet.weights.checkpoint import load_checkpoint, save_checkpoint
+from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED
-from predmapnet.weights.fit import start_from
 from tests.benchmarks.real_roads import reference_folder
 from tests.real_roads.argoverse_folder import write_with_images
 
@@ -104,20 +102,10 @@ def drives(folder: Path, steps: int, say: Say) -> bool:
     write_with_images(logs / OWN_CAMERAS, folder / "av2", LOG_FRAMES, LOG_SCALE)
     sets = (DataSet("demo"), DataSet("argoverse2", folder / "av2"), DataSet("log", street))
     data = DataOptions(sets, default_cache() / "training", towns=2, validation=0)
-    options = RunOptions(preset("lite"), data, folder / "run", loop=OFTEN, initial=without_forecast(folder))
+    options = RunOptions(preset("lite"), data, folder / "run", loop=OFTEN, initial=SHIPPED)
     rate = 3e-4  # It begins with weights that know something.
     train_network(replace(options, plan=PlanOptions(steps=steps, learning_rate=rate)), lambda line: None)
     return tell(folder / "run", say)
-
-
-def without_forecast(folder: Path) -> Path:
-    """Write the shipped weights with a forecast that begins at random."""
-    torch.manual_seed(0)
-    network, path = PredMapNet(preset("lite")), folder / "start.safetensors"
-    tensors = load_checkpoint(SHIPPED).network.state_dict()
-    start_from(network, {name: value for name, value in tensors.items() if "future_guidance" not in name}, SHIPPED)
-    save_checkpoint(path, network, {})
-    return path
 
 
 def frame(folder: Path, steps: int, say: Say) -> bool:

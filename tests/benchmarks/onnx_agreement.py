@@ -1,6 +1,6 @@
 """A drive through the network at its own size, in torch and in ONNX Runtime: what differs, and what both cost.
 
-    python -m tests.benchmarks.onnx_agreement [--preset paper-nuscenes] [--frames 11] [--rows 300] [--graphs FOLDER]
+    python -m tests.benchmarks.onnx_agreement [--preset paper-nuscenes] [--frames 40] [--rows 300] [--graphs FOLDER]
 
 Weights and images are random; thresholds are set so that some rows become tracks, and some tracks end. One thread.
 ``--graphs`` keeps the exported graphs, or takes those that lie there; export takes minutes.
@@ -30,9 +30,9 @@ from predmapnet.presets import preset
 from tests.predmapnet.export.test_onnx_graphs import TOLERANCE, drive, networks_checkpoint, rows_of
 from tests.predmapnet.small_networks import changed
 
-THRESHOLDS = {"first_tau_d": 0.57, "tau_d": 0.648, "tau_t": 0.618}
-"""Random weights score everything between 0.5 and 0.7, and the more tracks there are, the higher: in the twelfth frame
-there are more than 300."""
+THRESHOLDS = {"first_tau_d": 0.57, "tau_d": 0.625, "tau_t": 0.67}
+"""Random weights score everything between 0.5 and 0.7, and the more tracks there are, the higher: where tracks live on
+as easily as they are born, there are soon more than 300."""
 Result = TypeVar("Result")
 
 
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Print a line a frame, and the worst; 1 where the engines differ."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.onnx_agreement")
     parser.add_argument("--preset", default="paper-nuscenes")
-    parser.add_argument("--frames", type=int, default=11)
+    parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--rows", type=int, default=300)
     parser.add_argument("--graphs", type=Path)
     options = parser.parse_args(arguments)
