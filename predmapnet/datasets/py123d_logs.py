@@ -94,7 +94,7 @@ def _table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
             raise ValueError("its metadata are no dictionary")
         if len(set(table.column_names)) < table.num_columns:
             raise ValueError(f"it has a column twice: {', '.join(table.column_names)}")
-    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is no file of py123d, or damaged: {error}.") from error
     prefix = f"{path.stem}."
     return table.rename_columns([name.removeprefix(prefix) for name in table.column_names]), metadata
@@ -103,6 +103,8 @@ def _table(path: Path) -> tuple[pa.Table, dict[str, Any]]:
 def _column(table: pa.Table, name: str, path: Path) -> list[Any]:
     if name not in table.column_names:
         raise UserError(f"{path}: the column '{name}' is missing; there are: {', '.join(table.column_names)}.")
+    if pa.types.is_temporal(table[name].type):  # not all of them can be Python's
+        raise UserError(f"{path}: the column '{name}' holds {table[name].type}, not numbers.")
     return list(table[name].to_pylist())
 
 
@@ -176,6 +178,8 @@ def _images(table: pa.Table, path: Path, root: Path | None) -> Iterator[tuple[in
     times = _times(table, path)
     if "data" not in table.column_names:
         raise UserError(f"{path}: the column 'data' is missing.")
+    if pa.types.is_temporal(table["data"].type):
+        raise UserError(f"{path}: the column 'data' holds no images and no names of files.")
     video = cv2.VideoCapture(str(path.with_suffix(".mp4"))) if pa.types.is_integer(table["data"].type) else None
     for time, scalar in zip(times, table["data"], strict=True):
         data = scalar.as_py()
@@ -197,10 +201,13 @@ def _images(table: pa.Table, path: Path, root: Path | None) -> Iterator[tuple[in
 
 
 def _file(root: Path, name: str) -> bytes:
-    path = Path(os.path.realpath(root / name))
-    if not path.is_relative_to(os.path.realpath(root)):
-        raise UserError(f"The image {name} would lie outside of {root}.")
-    return path.read_bytes()
+    try:
+        path = Path(os.path.realpath(root / name))
+        if not path.is_relative_to(os.path.realpath(root)):
+            raise UserError(f"The image {name} would lie outside of {root}.")
+        return path.read_bytes()
+    except ValueError as error:  # a name that no disk can hold
+        raise UserError(f"There is no image {name!r} in {root}: {error}.") from None
 
 
 def _ending(content: bytes, path: Path) -> str:

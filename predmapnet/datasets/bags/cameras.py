@@ -138,7 +138,7 @@ def _info_topic(topic: ImageTopic, infos: Mapping[str, Any]) -> str | None:
 
 def _names(topics: list[str]) -> dict[str, str]:
     """Return a short name of each topic: without what all share at the beginning, and without the image's name."""
-    spaces = {topic: PurePosixPath("/", topic).parent for topic in topics}
+    spaces = {topic: PurePosixPath("/" + topic.strip("/")).parent for topic in topics}
     shared = PurePosixPath(commonpath(map(str, spaces.values()))) if spaces else PurePosixPath("/")
     if shared in spaces.values():
         shared = shared.parent

@@ -46,7 +46,7 @@ class Reader:
 
         try:
             return self._store.deserialize_cdr(recorded.data, recorded.kind)
-        except SerdeError:
+        except (SerdeError, MemoryError):  # a length may be anything
             self.damaged[recorded.topic] += 1
             return None
 

@@ -130,7 +130,7 @@ def _mcap_messages(bag: Bag, file: Path, stream: IO[bytes], kinds: Collection[st
     from mcap.stream_reader import StreamReader, breakup_chunk
     from zstandard import ZstdError
 
-    broken = (McapError, ZstdError, struct.error, ValueError, RuntimeError, MemoryError)
+    broken = (McapError, ZstdError, struct.error, ValueError, OverflowError, RuntimeError, MemoryError)
     schemas: dict[int, str] = {0: "no schema"}
     channels: dict[int, tuple[str, str]] = {}
     lost = 0

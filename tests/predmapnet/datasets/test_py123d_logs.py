@@ -61,12 +61,22 @@ def test_a_log_of_py123d_becomes_the_log_that_it_was_made_from(folder, log, tmp_
     assert made.images == {"pcam_f0": 12, "pcam_l0": 12} and made.notes == []
 
 
+def path_with_null(log: Path, folder: Path) -> Path:
+    write_py123d(log, folder, "path")
+    table = pa.ipc.open_file((folder / "camera.pcam_f0.arrow").read_bytes()).read_all()
+    with pa.ipc.new_file(str(folder / "camera.pcam_f0.arrow"), table.schema) as file:
+        file.write_table(table.set_column(1, table.schema.field(1), pa.array(["a\0b"] * len(table))))
+    return folder
+
+
 def test_images_may_be_files_elsewhere(log, tmp_path):
     folder = write_py123d(log, tmp_path / "py123d", "path")
     with pytest.raises(UserError, match="--sensor-root"):
         log_from_py123d(folder, tmp_path / "out")
     log_from_py123d(folder, tmp_path / "front", ["pcam_f0"], log / "images" / "pcam_f0")
     assert [path.name for path in (tmp_path / "front" / "images").iterdir()] == ["pcam_f0"]
+    with pytest.raises(UserError, match="no image"):
+        log_from_py123d(path_with_null(log, tmp_path / "null"), tmp_path / "out", ["pcam_f0"], log / "images")
     with pytest.raises(UserError, match="outside"):
         outside = write_py123d(log, tmp_path / "again", "path")
         table = pa.ipc.open_file((outside / "camera.pcam_f0.arrow").read_bytes()).read_all()
@@ -94,11 +104,11 @@ def test_images_may_be_a_video(log, tmp_path):
 def rewrite(folder: Path, key: str, change) -> None:
     """Change the metadata of a file."""
     table = pa.ipc.open_file((folder / f"{key}.arrow").read_bytes()).read_all()
-    metadata = msgpack.unpackb(table.schema.metadata[b"metadata"])
-    change(metadata)
-    with pa.ipc.new_file(
-        str(folder / f"{key}.arrow"), table.schema.with_metadata({"metadata": msgpack.packb(metadata)})
-    ) as file:
+    if not isinstance(change, bytes):
+        metadata = msgpack.unpackb(table.schema.metadata[b"metadata"])
+        change(metadata)
+        change = msgpack.packb(metadata)
+    with pa.ipc.new_file(str(folder / f"{key}.arrow"), table.schema.with_metadata({"metadata": change})) as file:
         file.write_table(table)
 
 
@@ -144,7 +154,10 @@ def test_undistorted_images_have_no_lens(folder, tmp_path):
         (lambda folder: rewrite(folder, "camera.pcam_f0", lambda m: m.update(width=64)), "principal point"),
         (lambda folder: columns(folder, lambda table: table.append_column(table.schema[0], table[0])), "column twice"),
         (lambda folder: columns(folder, lambda table: table.set_column(0, table.schema[0].name, times(table[0]))),
-         "whole number of microseconds"),
+         "not numbers"),
+        (lambda folder: columns(folder, lambda table: table.set_column(1, table.schema[1].name, times(table[0]))),
+         "no images and no names"),
+        (lambda folder: rewrite(folder, "camera.pcam_f0", b"\x81\x91\x01\x02"), "no file of py123d, or damaged"),
         (lambda folder: columns(folder, lambda table: table.set_column(0, table.schema[0].name, later(table[0]))),
          "whole number of microseconds"),
         (lambda folder: columns(folder, lambda table: table.set_column(1, table.schema[1].name, [[True] * 12])),

@@ -9,6 +9,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from predmapnet.datasets.bags.cameras import _names
 from predmapnet.datasets.bags.conversion import log_from_bag
 from predmapnet.datasets.bags.storage import ZSTD
 from predmapnet.datasets.own_logs.scene import LogScene
@@ -129,3 +130,20 @@ def test_rows_of_other_kinds_are_damage(drawn, tmp_path, change):
 def test_endings_may_be_capital_letters(drawn, tmp_path):
     (file,) = drawn.write(tmp_path / "bag").glob("*.mcap")
     assert log_from_bag(file.rename(tmp_path / "BAG.MCAP"), tmp_path / "out").notes == []
+
+
+def test_a_record_of_impossible_length_ends_the_bag(drawn, tmp_path):
+    (file,) = drawn.write(tmp_path / "bag").glob("*.mcap")
+    data = bytearray(file.read_bytes())
+    with file.open("rb") as stream:
+        place = make_reader(stream).get_summary().chunk_indexes[-1].chunk_start_offset
+    data[place + 1 : place + 9] = b"\xff" * 8
+    file.write_bytes(data)
+    with pytest.raises(UserError, match="is cut off or damaged"):
+        log_from_bag(file, tmp_path / "out")
+
+
+@pytest.mark.parametrize("topic", ["//image", "image", "/a//image"])
+def test_topics_of_any_slashes_have_a_camera_name(topic):
+    (name,) = _names([topic]).values()
+    assert name and "/" not in name
