@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import typer
@@ -11,6 +12,7 @@ import typer
 import predmapnet as package
 from cli.main import app
 
+ROOT = Path(package.__file__).parents[1]
 ENVIRONMENT = {**os.environ, "COLUMNS": "80"}
 
 
@@ -36,6 +38,15 @@ def test_the_help_of_a_command_is_whole_at_80_columns(predmapnet, monkeypatch, w
         for option in (*parameter.opts, *parameter.secondary_opts):
             if option.startswith("-"):
                 assert option in result.out
+
+
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")], ids=lambda page: page.name)
+def test_documented_options_exist(page):
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for words, found in every_command().items():
+        known = {option for parameter in found.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        for line in re.findall(rf"predmapnet {' '.join(words)}\b([^\n`#]*)", text):
+            assert set(re.findall(r"--[a-z][a-z-]*", line)) <= known | {"--help"}, (words, line)
 
 
 def test_every_command_speaks_json():
