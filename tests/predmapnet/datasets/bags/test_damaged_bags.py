@@ -137,7 +137,8 @@ def test_a_record_of_impossible_length_ends_the_bag(drawn, tmp_path):
     data = bytearray(file.read_bytes())
     with file.open("rb") as stream:
         place = make_reader(stream).get_summary().chunk_indexes[-1].chunk_start_offset
-    data[place + 1 : place + 9] = b"\xff" * 8
+    # Before it: code, length, both times, size, checksum and the empty name of a compression.
+    data[place + 41 : place + 49] = b"\xff" * 8
     file.write_bytes(data)
     with pytest.raises(UserError, match="is cut off or damaged"):
         log_from_bag(file, tmp_path / "out")
