@@ -51,8 +51,9 @@ def drawn_outline(outline: shapely.Polygon) -> shapely.Polygon:
     if not quadrilateral.is_valid or quadrilateral.convex_hull.area > 1.001 * quadrilateral.area:
         return simple
     away = shapely.distance(shapely.points(samples), quadrilateral.exterior).max()
-    common = shapely.intersection(outline, quadrilateral).area
-    overlap = common / (outline.area + quadrilateral.area - common)
+    whole = shapely.buffer(outline, 0)  # An outline may cross itself, which intersections do not take.
+    common = shapely.intersection(whole, quadrilateral).area
+    overlap = common / (whole.area + quadrilateral.area - common)
     return quadrilateral if away <= TOLERANCE and overlap >= LEAST_OVERLAP else simple
 
 
