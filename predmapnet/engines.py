@@ -104,5 +104,5 @@ class TorchEngine:
             geometry = self.network.view_geometry(calibration)
         self._geometries[key] = geometry
         if len(self._geometries) > CALIBRATIONS_KEPT:
-            del self._geometries[next(iter(self._geometries))]
+            self._geometries.pop(next(iter(self._geometries)), None)  # another thread may have been first
         return geometry

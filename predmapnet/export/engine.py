@@ -104,7 +104,7 @@ class OnnxEngine:
             arrays = {name: value.numpy() for name, value in geometry_tensors(geometry).items()}
         self._geometries[key] = arrays
         if len(self._geometries) > CALIBRATIONS_KEPT:
-            del self._geometries[next(iter(self._geometries))]
+            self._geometries.pop(next(iter(self._geometries)), None)  # another thread may have been first
         return arrays
 
 

@@ -45,7 +45,8 @@ class RayExecutor:
         nodes = sum(node["Alive"] for node in self._ray.nodes())
         devices = int(resources.get("GPU", 0)) if gpus else 0
         self.jobs = jobs or devices or max(1, (int(resources.get("CPU", 1)) - nodes) // threads)
-        self.place = f"{self.jobs} actors on {nodes} node{'s' if nodes > 1 else ''}"
+        several = "s" if self.jobs > 1 else ""
+        self.place = f"{self.jobs} actor{several} on {nodes} node{'s' if nodes > 1 else ''}"
         share = min(1.0, devices / self.jobs)
         self._options = {"num_cpus": threads, "num_gpus": share, "max_restarts": 0, "scheduling_strategy": "SPREAD"}
         self._time_limit, self._say = time_limit, say
