@@ -143,6 +143,8 @@ def main() -> None:
     parser.add_argument("--mapped", type=int, default=12, help="scenes of each run when the speed is compared")
     parser.add_argument("--rounds", type=int, default=2)
     options = parser.parse_args()
+    if options.scenes < 10 or options.mapped < 7:
+        parser.error("It takes 10 scenes, and 7 that are mapped: the first and the last are not measured.")
     scenes = (ListedScene(f"scene-{number:05d}", Path("/data")) for number in range(options.scenes))
     memory, wall, cpu = [], 0.0, 0.0
     with executor_of(options.engine, 2) as executor:
