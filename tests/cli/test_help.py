@@ -13,6 +13,7 @@ import predmapnet as package
 from cli.main import app
 
 ROOT = Path(package.__file__).parents[1]
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
 ENVIRONMENT = {**os.environ, "COLUMNS": "80"}
 
 
@@ -40,13 +41,21 @@ def test_the_help_of_a_command_is_whole_at_80_columns(predmapnet, monkeypatch, w
                 assert option in result.out
 
 
-@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_documented_options_exist(page):
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     for words, found in every_command().items():
         known = {option for parameter in found.params for option in (*parameter.opts, *parameter.secondary_opts)}
         for line in re.findall(rf"predmapnet {' '.join(words)}\b([^\n`#]*)", text):
             assert set(re.findall(r"--[a-z][a-z-]*", line)) <= known | {"--help"}, (words, line)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_documented_benchmarks_and_their_options_exist(page):
+    for module, line in re.findall(r"python -m (tests(?:\.\w+)+)([^\n`|]*)", page.read_text(encoding="utf-8")):
+        code = ROOT.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+        for option in re.findall(r"--[a-z][a-z-]*", line):
+            assert f'"{option}"' in code, (module, option)
 
 
 def test_every_command_speaks_json():
