@@ -87,7 +87,8 @@ def measured(options: RunOptions) -> dict[str, float]:
     """
     result, weights = options.folder / RESULT, options.folder / WEIGHTS
     if result.exists():
-        return orjson.loads(result.read_bytes())
+        stored: dict[str, float] = orjson.loads(result.read_bytes())
+        return stored
     if not weights.exists():
         say(f"training {options.folder}")
         resume = latest(options.folder) is not None

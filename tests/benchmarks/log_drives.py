@@ -15,8 +15,9 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from predmapnet.machine import use_threads
@@ -46,7 +47,7 @@ from predmapnet.demo_world.world import Trajectory
 from predmapnet.machine import NetworkOptions
 from predmapnet.runs.infer import MappingPipeline, SceneReport
 from predmapnet.runs.outputs import Outputs
-from predmapnet.scenes import Camera
+from predmapnet.scenes import Camera, Image
 from tests.benchmarks.endless_drive import SCENE, resident_megabytes
 from tests.real_roads.road_maps import truth_along
 
@@ -88,7 +89,7 @@ class DrawnCamera:
         }
         return entry if self.lens is None else entry | {"distortion": self.lens.distortion.tolist()}
 
-    def stored(self, image: Float) -> Float:
+    def stored(self, image: Image) -> Image:
         """Return the image that is stored of what was drawn."""
         if self.lens is None:
             return image
@@ -97,7 +98,8 @@ class DrawnCamera:
         ahead = np.where(rays[:, 2:] > 0.05, rays, [1e3, 1e3, 1.0])
         pixels = (ahead / ahead[:, 2:] @ self.pinhole.intrinsics.T)[:, :2] - 0.5
         places = pixels.reshape(self.lens.height, self.lens.width, 2).astype(np.float32)
-        return np.asarray(cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+        x, y = places[..., 0], places[..., 1]
+        return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT), np.uint8)
 
 
 def camera(name: str, place: tuple[float, float, float], yaw: float, pitch: float, fisheye: bool) -> DrawnCamera:
@@ -167,31 +169,26 @@ def write_log(folder: Path, car: tuple[DrawnCamera, ...], frames: int, rate: flo
     return folder
 
 
-def mapped(folder: Path, rate: float, every: int) -> Iterator[tuple[int, float, float] | SceneReport]:
-    """Map a log as ``predmapnet infer`` does: frame, CPU milliseconds per frame and megabytes, and last the report."""
-    lines: list[tuple[int, float, float]] = []
+def mapped(folder: Path, rate: float, every: int, say: Callable[[str], None]) -> SceneReport:
+    """Map a log as ``predmapnet infer`` does; say frame, CPU milliseconds per frame and megabytes on the way."""
     began = time.process_time()
 
     def watch(done: int, total: int) -> None:
         nonlocal began
         if done and done % every == 0:
             now = time.process_time()
-            lines.append((done, 1e3 * (now - began) / every, resident_megabytes()))
+            say(f"{done:10d}{1e3 * (now - began) / every:12.1f}{resident_megabytes():12.0f}")
             began = now
-            if __name__ == "__main__":
-                print("{:10d}{:12.1f}{:12.0f}".format(*lines[-1]), flush=True)
 
     pipeline = MappingPipeline.open("log", folder, NetworkOptions(), rate=rate)
-    report = pipeline.run(None, Outputs(map=folder.parent / "map.geojson"), progress=watch).report
-    yield from lines
-    yield report
+    return pipeline.run(None, Outputs(map=folder.parent / "map.geojson"), progress=watch).report
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as temporary:
         log = write_log(Path(temporary) / options.car, CARS[options.car], options.frames, options.rate)
         print(f"{'frame':>10s}{'CPU ms':>12s}{'memory MB':>12s}", flush=True)
-        *_, told = mapped(log, options.rate, options.every)
+        told = mapped(log, options.rate, options.every, partial(print, flush=True))
         print(told.elements, told.metres)
         if told.accuracy is not None:
             print(told.accuracy)

@@ -132,7 +132,8 @@ def merged(place: Place, drives: Sequence[MappedDrive]) -> Remains:
     own: list[Float] = []
     for number, drive in enumerate(drives):
         correction = status[f"map {number}"].correction
-        motion = pose(*correction.apply(np.zeros((1, 2)))[0], correction.turn)
+        x, y = correction.apply(np.zeros((1, 2)))[0]
+        motion = pose(x, y, correction.turn)
         own.extend(motion @ at for at in drive.poses)
     true = [at for drive in drives for at in drive.true_poses]
     common = _common_motion(own, true)

@@ -36,7 +36,7 @@ from predmapnet.network.image_input import input_size
 from predmapnet.network.kernels.inference import for_inference
 from predmapnet.network.kernels.matrix_product import linear
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, FrameOutputs, Instances, StreamState
+from predmapnet.network.state import FrameInputs, FrameOutputs, ImageFeatures, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows, select
 from predmapnet.presets import preset
 from tests.benchmarks.part_costs import OF_THE_PAPER, PARTS, THE_REST, Ledger, parameters_of_parts
@@ -51,13 +51,13 @@ OFFICIAL_SECONDS = (23.4, 25.7)
 def modules_in_turn(config: PredMapNetConfig) -> dict[str, PredMapNetConfig]:
     """Return the configurations from the baseline, without any of the paper's modules, to all of them."""
     semantic, history, future = config.semantic_queries, config.history_map, config.future
-    off = {
+    off: dict[str, object] = {
         "semantic_queries": semantic.model_copy(update={"enabled": False}),
         "history_map": history.model_copy(update={"memory": False, "guidance": False}),
         "future": future.model_copy(update={"enabled": False}),
         "depth": config.depth.model_copy(update={"enabled": False}),
     }
-    turns = [
+    turns: list[tuple[str, dict[str, object]]] = [
         ("baseline", {}),
         ("+ semantic-aware query generator", {"semantic_queries": semantic}),
         ("+ history map memory", {"history_map": history.model_copy(update={"guidance": False})}),
@@ -94,7 +94,7 @@ class Drive:
         images = torch.randn(1, len(DEMO_RIG), 3, *input_size(self.network.config.image))
         return FrameInputs(images, torch.ones(1, len(DEMO_RIG), dtype=torch.bool), pose, self.calibration)
 
-    def step(self, inputs: FrameInputs, ledger: Ledger, images: object = None) -> object:
+    def step(self, inputs: FrameInputs, ledger: Ledger, images: ImageFeatures | None = None) -> ImageFeatures:
         """Map one frame; return the image features, which another network of the same backbone may take."""
         network = self.network
         with ledger.watching(network), ledger.running(THE_REST):

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,11 +22,11 @@ import numpy as np
 import torch
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.engines import TorchEngine
+from predmapnet.engines import Engine, TorchEngine
 from predmapnet.export.engine import OnnxEngine
 from predmapnet.export.onnx_files import export_graphs, read_graph_folder
 from predmapnet.machine import Precision, use_threads
-from predmapnet.network.state import Instances
+from predmapnet.network.state import Instances, StreamState
 from predmapnet.presets import preset
 from tests.predmapnet.export.test_onnx_graphs import TOLERANCE, drive, networks_checkpoint, rows_of
 from tests.predmapnet.small_networks import changed
@@ -64,7 +65,8 @@ def main(arguments: list[str] | None = None) -> int:
     use_threads(1)
     sections = changed(preset(options.preset).model_dump(), {"tracking": THRESHOLDS})
     config = PredMapNetConfig.model_validate(sections)
-    checkpoint, seconds = networks_checkpoint(config), ([], [], [])
+    checkpoint = networks_checkpoint(config)
+    seconds: tuple[list[float], list[float], list[float]] = ([], [], [])
     with tempfile.TemporaryDirectory() as temporary:
         folder = options.graphs or Path(temporary) / "graphs"
         if not folder.exists():
@@ -72,15 +74,15 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"exported in {seconds[2][0]:.0f} CPU s", flush=True)
         graphs = read_graph_folder(folder)
         assert graphs.config == config, f"{folder} holds graphs of another network"
-        engines = TorchEngine(checkpoint.network, "cpu", Precision.FLOAT32, compiled=False), OnnxEngine(graphs, 1)
-    states, size, worst = [None, None], np.array([config.roi_length, config.roi_width]), np.zeros(2)
+        in_torch = TorchEngine(checkpoint.network, "cpu", Precision.FLOAT32, compiled=False)
+        engines: tuple[Engine, Engine] = in_torch, OnnxEngine(graphs, 1)
+    states: list[StreamState | None] = [None, None]
+    size, worst = np.array([config.roi_length, config.roi_width]), np.zeros(2)
     with torch.inference_mode():
         for index, inputs in enumerate(drive(config, options.frames)):
             found = []
             for number, engine in enumerate(engines):
-                selection, states[number], _ = timed(
-                    seconds[number], lambda e=engine, s=states[number], i=inputs: e.step(i, s)
-                )
+                selection, states[number], _ = timed(seconds[number], partial(engine.step, inputs, states[number]))
                 found.append(selection)
             tracks = apart(found[0].instances, found[1].instances, size)
             others = apart(found[0].detections, found[1].detections, size)

@@ -53,7 +53,9 @@ def write_small(shot: Path, picture: Path) -> None:
     """Write a screenshot at its size on the screen, with 256 colours: a quarter of the bytes."""
     from PIL import Image
 
-    small = cv2.resize(cv2.imread(str(shot)), SIZE, interpolation=cv2.INTER_AREA)
+    large = cv2.imread(str(shot))
+    assert large is not None, f"{shot} is no picture"
+    small = cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA)
     image = Image.fromarray(cv2.cvtColor(small, cv2.COLOR_BGR2RGB))
     image.quantize(256, dither=Image.Dither.NONE).save(picture, optimize=True)
 

@@ -18,6 +18,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -106,20 +107,21 @@ def _photograph_parts(root: Path, step: int) -> Iterator[Part | Missing]:
     if (street / "truth.json").is_file():
         for start in range(STREET_STEP):
             name, group = f"street, every {STREET_STEP}th frame from {start}", f"street, every {STREET_STEP}th frame"
-            yield Part(name, group, lambda first=start: _from(open_street(street), first, STREET_STEP * step))
-        yield Part("street, all frames", "", lambda: _from(open_street(street), 0, step))
+            yield Part(name, group, partial(_street, street, start, STREET_STEP * step))
+        yield Part("street, all frames", "", partial(_street, street, 0, step))
     else:
         yield Missing("street", f"{street} holds no truth.json")
     sample = root / "ground_truth" / "nuscenes_sample"
     if (sample / "v1.0-mini").is_dir():
         source = NuScenesSource(sample)
         for info in source.scenes():
-            yield Part(f"nuScenes sample {info.name}", "", lambda name=info.name: _without_truth(source.open(name)))
+            yield Part(f"nuScenes sample {info.name}", "", partial(_without_truth, source, info.name))
     else:
         yield Missing("nuScenes sample", f"{sample} holds no v1.0-mini")
 
 
-def _from(scene: Scene, first: int, step: int) -> Scene:
+def _street(folder: Path, first: int, step: int) -> Scene:
+    scene = open_street(folder)
     return ChosenFrames(scene, range(first, len(scene), step))
 
 
@@ -132,8 +134,9 @@ def _dressed(kind: str, drive: DressedDrive, cache: Path, step: int) -> Part:
     return Part(name, f"{kind}, {drive.rig_name} rig", lambda: drive.open(cache, step, tell))
 
 
-def _without_truth(scene: Any) -> Scene:
+def _without_truth(source: NuScenesSource, name: str) -> Scene:
     """The sample's map is made up, so nothing true is known of its photographs."""
+    scene = source.open(name)
     scene.ground_truth = None
     return scene
 

@@ -38,14 +38,15 @@ MARGIN = 5.0
 WHITE = (255, 255, 255)
 
 
-def camera_picture(path: Path, camera: Camera, found: FrameMap) -> Image:
+def camera_picture(stored: Path | Image, camera: Camera, found: FrameMap) -> Image:
     """Draw the tracks of an instant into an image of it; returns ``(h, CAMERA_WIDTH, 3)``."""
-    image = read_camera_image(path, camera).copy()
+    image = read_camera_image(stored, camera).copy()
     for kind, line, score in zip(found.kinds, found.polylines, found.scores, strict=True):
         if score >= LOWEST_SCORE:
             for part in project_line(line, camera):
                 draw(image, part, KIND_COLOURS[kind], 3)
-    return np.asarray(cv2.resize(image, (CAMERA_WIDTH, round(camera.height * CAMERA_WIDTH / camera.width))))
+    size = (CAMERA_WIDTH, round(camera.height * CAMERA_WIDTH / camera.width))
+    return np.asarray(cv2.resize(image, size), np.uint8)
 
 
 def map_picture(found: GlobalMap, truth: GlobalMap, seen: shapely.Geometry, heading: Float, width: int) -> Image:
@@ -58,7 +59,7 @@ def map_picture(found: GlobalMap, truth: GlobalMap, seen: shapely.Geometry, head
     picture = np.full((round((high - low)[1] * scale), width, 3), BACKGROUND, np.uint8)
 
     def drawn(points: Float) -> Float:
-        return (points @ turn.T - [low[0], high[1]]) * [scale, -scale]
+        return np.asarray((points @ turn.T - [low[0], high[1]]) * [scale, -scale])
 
     for element in found.elements:
         draw(picture, drawn(element.points), KIND_COLOURS[element.kind], 6)

@@ -26,10 +26,10 @@ from predmapnet.files import check_output, write_file
 from predmapnet.machine import NetworkOptions
 from predmapnet.mapper import Mapper
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.scenes import Scene
+from predmapnet.scenes import Image, Scene
 from tests.benchmarks.bad_days import Remains, measured, open_scenes, remains
 from tests.real_roads.bad_scenes import FaultyImages, LostCameras, LostImages
-from tests.real_roads.image_faults import Image, Shot
+from tests.real_roads.image_faults import Shot
 from tests.real_roads.scene_views import every
 
 DARK = range(16, 24)
@@ -61,7 +61,7 @@ def without_future_guidance(network: PredMapNet) -> None:
     """Short-term future guidance off: no forecasts reach the track queries."""
     future = network.future_guidance
     assert future is not None
-    future.forward = lambda queries, _: queries  # type: ignore[method-assign]
+    future.forward = lambda queries, forecasts: queries  # type: ignore[method-assign]
 
 
 def without_guidance(network: PredMapNet) -> None:

@@ -72,7 +72,7 @@ def test_cost_of_add(size, capsys):
     before = resident()
     integrator = filled(size)
     memory = resident() - before
-    milliseconds = []
+    milliseconds: list[float] = []
     for _ in range(3):  # fresh drives past the same lines, so that chance weighs less
         for frame in frames():
             start = time.process_time()

@@ -11,13 +11,15 @@ import argparse
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TypeVar
 
 import torch
 
 from predmapnet.demo_world.catalogue import default_cache
 from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data
+from predmapnet.frame_cache.scene_cache import CachedFrame
 from predmapnet.machine import use_threads
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
@@ -51,6 +53,9 @@ def main(arguments: list[str] | None = None) -> int:
         costs[name].append(1000 * (time.process_time() - start) / stage.batch)
         return result
 
+    def read(draws: Sequence[int]) -> list[list[CachedFrame]]:
+        return [clips[draw] for draw in draws]
+
     def update() -> None:
         torch.nn.utils.clip_grad_norm_(network.parameters(), stage.optimiser.clip_norm)
         optimiser.step()
@@ -58,9 +63,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     for step in range(options.steps):
         draws = range(step * stage.batch, (step + 1) * stage.batch)
-        frames = timed("reading and augmentation", lambda draws=draws: [clips[draw] for draw in draws])
-        segment = timed("targets and collation", lambda frames=frames: clips.collate(frames))
-        terms = timed("forward and losses", lambda segment=segment, step=step: training(segment, step))
+        frames = timed("reading and augmentation", partial(read, draws))
+        segment = timed("targets and collation", partial(clips.collate, frames))
+        terms = timed("forward and losses", partial(training, segment, step))
         optimiser.zero_grad(set_to_none=True)
         timed("backward", torch.stack(list(terms.values())).sum().backward)
         timed("optimiser", update)

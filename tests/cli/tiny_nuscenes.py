@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +23,7 @@ STEP_METRES = 4.0
 START_TIME = 1_500_000_000_000_000
 LOCATION = "singapore-onenorth"
 """The only names that the reader can place on Earth are those of the real maps."""
+Record = dict[str, Any]
 
 EMPTY_LAYERS = (
     "drivable_area",
@@ -42,7 +44,7 @@ EMPTY_LAYERS = (
 def write_tiny_nuscenes(root: Path, scenes: tuple[str, ...] = ("scene-0001",), frames: int = 3) -> Path:
     """Write tables, images of noise and stripes, and a map with one straight road."""
     names = ("scene", "sample", "sample_data", "ego_pose", "calibrated_sensor", "sensor", "log", "map")
-    tables: dict[str, list[dict]] = {name: [] for name in names}
+    tables: dict[str, list[Record]] = {name: [] for name in names}
     log = {"token": "log", "logfile": "n015", "vehicle": "n015", "date_captured": "2018-07-24", "location": LOCATION}
     tables["log"].append(log)
     tables["map"].append({"token": "map", "log_tokens": ["log"], "category": "semantic_prior", "filename": ""})
@@ -86,7 +88,7 @@ def edit_table(root: Path, name: str, change) -> None:
     path.write_text(json.dumps(records, indent=0))
 
 
-def _calibration(channel: str) -> dict:
+def _calibration(channel: str) -> Record:
     record = {"token": f"calibration-{channel}", "sensor_token": f"sensor-{channel}"}
     if channel == "LIDAR_TOP":
         return record | {"translation": [0.9, 0.0, 1.8], "rotation": LIDAR_YAW, "camera_intrinsic": []}
@@ -111,7 +113,7 @@ def _multiply(first: tuple[float, ...], second: tuple[float, ...]) -> tuple[floa
 
 
 def _write_frame(
-    root: Path, tables: dict[str, list[dict]], scene: str, token: str, tokens: list[str], index: int, number: int
+    root: Path, tables: dict[str, list[Record]], scene: str, token: str, tokens: list[str], index: int, number: int
 ) -> None:
     timestamp = START_TIME + index * 500_000
     before, after = (["", *tokens])[index], ([*tokens, ""])[index + 1]

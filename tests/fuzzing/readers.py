@@ -49,7 +49,7 @@ from predmapnet.weights.inspection import inspect_file
 from predmapnet.weights.maptracker_import import import_maptracker, read_official_checkpoint
 from tests.fuzzing import examples
 from tests.fuzzing.recordings import RECORDINGS
-from tests.predmapnet.small_networks import small_config
+from tests.predmapnet.small_networks import Sections, small_config
 from tests.predmapnet.training.painted_scenes import painted_scene, tiny_config
 
 ROI = RegionOfInterest()
@@ -70,7 +70,7 @@ class Reader:
 
     name: str
     write: Callable[[Path], list[Path]]
-    read: Callable[[Path, Path], None]
+    read: Callable[[Path, Path], object]
     outputs: frozenset[str] = field(default_factory=frozenset)
 
     def written(self, folder: Path) -> set[Path]:
@@ -154,7 +154,7 @@ def _read_results(folder: Path, changed: Path) -> None:
 
 
 def _write_weights(folder: Path) -> list[Path]:
-    off = {"enabled": False}
+    off: Sections = {"enabled": False}
     config = small_config(
         "lite",
         bev={"backbone": {"stem": (4, 4), "widths": (4, 4, 4), "channels": 4}, "widths": (4, 4, 4), "memory": off},
@@ -315,10 +315,10 @@ READERS = {
         Reader("foreign-weights", _write_foreign, _read_foreign),
         Reader("training-run", _write_run, _read_run),
         Reader("configuration", _write_configurations, _read_configuration),
-        Reader("manifests", examples.write_manifests, lambda _, changed: [*map(str, read_manifest(changed))] and None),
+        Reader("manifests", examples.write_manifests, lambda _, changed: [*map(str, read_manifest(changed))]),
         Reader("records", examples.write_records, _read_records, frozenset({"summary.json"})),
         Reader("evaluations", examples.write_evaluations,
-               lambda at, _: compare_evaluations([at / "one.json", at / "two.json"]) and None),
+               lambda at, _: compare_evaluations([at / "one.json", at / "two.json"])),
         Reader("caches", _write_caches, _read_caches),
         *(Reader(name, write, read) for name, (write, read) in RECORDINGS.items()),
         *(Reader(f"map{suffix}", _write_maps(suffix), _read_map, BESIDE) for suffix in SUFFIXES),

@@ -37,6 +37,7 @@ def write_bags(folder: Path) -> list[Path]:
     drawn.drop(topic)
     for time, message in images:
         pixels = cv2.imdecode(message.data, cv2.IMREAD_GRAYSCALE)
+        assert pixels is not None
         drawn.messages.append(
             (topic.removesuffix("/compressed"), time, raw(pixels, "mono8", time, "left_camera_optical"))
         )

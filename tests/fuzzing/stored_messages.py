@@ -38,7 +38,7 @@ def words_mutated(data: bytes, generator: random.Random) -> bytes:
 
 def mcap_mutated(content: bytes, generator: random.Random) -> bytes:
     """Return an MCAP file with messages, their times, topics, types or order changed."""
-    messages = [
+    messages: list[list[Any]] = [
         [schema.name, channel.topic, channel.message_encoding, message.log_time, message.data]
         for schema, channel, message in make_reader(io.BytesIO(content)).iter_messages(log_time_order=False)
         if schema is not None
@@ -95,8 +95,8 @@ def _database_changed(database: sqlite3.Connection, table: str, generator: rando
     (old,) = database.execute(f'SELECT "{column}" FROM "{table}" WHERE rowid = ?', (row,)).fetchone() or (None,)
     action = generator.randrange(12)
     if action < 8:
-        blob = isinstance(old, bytes) and generator.random() < 0.8
-        value = words_mutated(old, generator) if blob else generator.choice(CELLS)
+        blob = old if isinstance(old, bytes) and generator.random() < 0.8 else None
+        value = generator.choice(CELLS) if blob is None else words_mutated(blob, generator)
         database.execute(f'UPDATE "{table}" SET "{column}" = ? WHERE rowid = ?', (value, row))
     elif action == 8:
         database.execute(f'DELETE FROM "{table}" WHERE rowid = ?', (row,))

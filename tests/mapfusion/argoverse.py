@@ -11,8 +11,9 @@ import pyarrow.feather as feather
 import shapely
 import shapely.ops
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap
-from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Detector, Drive, Float, element, pose, simulate
+from tests.mapfusion.simulation import BOUNDARY, CROSSING, DIVIDER, Detector, Drive, element, pose, simulate
 
 PROJECT = Path(__file__).parents[2]
 LOGS = (

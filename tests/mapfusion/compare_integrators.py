@@ -23,7 +23,8 @@ from tests.mapfusion.simulation import Drive, town_drive
 if TYPE_CHECKING:
     from tests.mapfusion.demo_towns import MappedTown
 
-INTEGRATORS = (MapIntegrator, PairwiseAveraging, LastObservationWins)
+Integrator = MapIntegrator | PairwiseAveraging | LastObservationWins
+INTEGRATORS: tuple[type[Integrator], ...] = (MapIntegrator, PairwiseAveraging, LastObservationWins)
 
 TUNING_SEEDS = range(10)
 """The assumptions of the integrator were chosen on these."""
@@ -32,7 +33,7 @@ HELD_OUT_SEEDS = range(200, 210)
 """Nobody has looked at these while choosing."""
 
 
-def average(integrator: type, drives: Iterable[Drive]) -> Quality:
+def average(integrator: type[Integrator], drives: Iterable[Drive]) -> Quality:
     """Return the mean figures of an integrator over several drives (ghosts: their sum)."""
     figures = []
     for drive in drives:
@@ -40,8 +41,8 @@ def average(integrator: type, drives: Iterable[Drive]) -> Quality:
         for frame in drive.frames:
             one.add(frame)
         figures.append(astuple(measure(one.map(), drive)))
-    mean = np.mean(figures, axis=0)
-    return Quality(*mean[:4].tolist(), ghosts_alive=int(np.sum(figures, axis=0)[4]))
+    precision, recall, lateral, elements, _ = np.mean(figures, axis=0).tolist()
+    return Quality(precision, recall, lateral, elements, ghosts_alive=int(np.sum(figures, axis=0)[4]))
 
 
 def simulated(seeds: Sequence[int], baselines: bool) -> None:

@@ -72,7 +72,7 @@ def measure(fused: GlobalMap, drive: Drive, within: float = 0.5, least_views: in
                 # a ring, or a closed line, whose start lies inside is still one piece
                 starts = int(np.diff(np.concatenate([[0], visible.astype(int)])).clip(0).sum())
                 closed = np.linalg.norm(points[0] - points[-1]) < 0.5 and bool(visible[0] and visible[-1])
-                true_elements += max(starts - closed, 1)
+                true_elements += max(starts - int(closed), 1)
         lines = [dense(e.points) for e in fused.of_kind(kind)]
         if lines:
             distance = nearest(np.concatenate(lines), truth)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from tests.mapfusion.simulation import pose
-
-Float = NDArray[np.float64]
 
 SIDEWAYS, ALONG, TURN = 0.75, 1.5, np.radians(0.85)
 """Standard deviations of the errors of poses: metres, metres, radians."""
@@ -25,7 +23,8 @@ def off_by_drive(poses: Sequence[Float], rng: np.random.Generator) -> list[Float
     """Return poses that are off as a whole: shifted along and across the mean direction, turned about their middle."""
     positions = np.array([at[:2, 3] for at in poses])
     way = np.mean([at[:2, 0] for at in poses], axis=0)
-    middle = pose(*positions.mean(axis=0), float(np.arctan2(way[1], way[0])))
+    x, y = positions.mean(axis=0)
+    middle = pose(x, y, float(np.arctan2(way[1], way[0])))
     motion = middle @ pose(*(rng.normal(size=3) * (ALONG, SIDEWAYS, TURN))) @ inverse_pose(middle)
     return [motion @ at for at in poses]
 

@@ -118,7 +118,7 @@ class Road:
         """Return points at stations ``s`` and offsets ``d``."""
         heading = np.interp(s, self.s, self.heading)
         centre = np.stack([np.interp(s, self.s, self.points[:, axis]) for axis in range(2)], axis=1)
-        return centre + np.asarray(d)[..., None] * np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+        return np.asarray(centre + np.asarray(d)[..., None] * np.stack([-np.sin(heading), np.cos(heading)], axis=1))
 
     def along(self, start: float, stop: float, d: float) -> Float:
         """Return a line of constant offset."""
@@ -217,10 +217,10 @@ def simulate(
                 found.append((int(true.kind), score, track_of[key], _err(true.kind, piece, rng, detector, stays)))
         for _ in range(rng.poisson(detector.ghosts * max(len(found), 1) / 1.5)):
             kind = ElementKind(int(rng.integers(3)))
-            ghost = (kind, transform_points(ego_to_global, _ghost(kind, rng)), [], next_track, int(rng.integers(1, 3)))
+            points = transform_points(ego_to_global, _ghost(kind, rng))
+            live.append((kind, points, [], next_track, int(rng.integers(1, 3))))
+            ghosts.append(live[-1])
             next_track += 1
-            live.append(ghost)
-            ghosts.append(ghost)
         for kind, points, seen, track, _ in live:
             for piece in visible_pieces(kind, transform_points(global_to_ego, points), box)[:1]:
                 seen.append(number)
@@ -291,7 +291,7 @@ def _err(
     noisy = points + (deviation * error).T + rng.normal(0.0, detector.jitter, points.shape)
     if kind.is_ring:
         noisy[-1] = noisy[0]
-    return np.clip(noisy, -ROI.size / 2, ROI.size / 2)
+    return np.asarray(np.clip(noisy, -ROI.size / 2, ROI.size / 2))
 
 
 def _ghost(kind: ElementKind, rng: np.random.Generator) -> Float:
@@ -303,4 +303,4 @@ def _ghost(kind: ElementKind, rng: np.random.Generator) -> Float:
     else:
         x = np.linspace(-0.5, 0.5, 10) * rng.uniform(6.0, 25.0)
         shape = np.stack([x, rng.normal(0.0, 0.01) * x**2], axis=1)
-    return shape @ turn.T + centre
+    return np.asarray(shape @ turn.T + centre)

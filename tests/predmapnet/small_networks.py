@@ -1,5 +1,7 @@
 """The networks of all tests: presets at small sizes, weights that are nowhere zero, and frames for them."""
 
+from typing import Any, TypeVar
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -12,7 +14,10 @@ from predmapnet.network.state import FrameInputs
 from predmapnet.network.track_selection import select
 from predmapnet.presets import preset
 
-LITE = {
+Module = TypeVar("Module", bound=nn.Module)
+Sections = dict[str, Any]
+"""Values of a configuration by name, sections within them."""
+LITE: Sections = {
     "image": {"width": 64, "height": 24},
     "bev": {
         "rows": 26,
@@ -26,7 +31,7 @@ LITE = {
     "future": {"hidden": 32},
 }
 SIZE = (64, 96)
-MAPTRACKER = {
+MAPTRACKER: Sections = {
     "image": {"height": SIZE[0], "width": SIZE[1]},
     "bev": {
         "rows": 10,
@@ -53,7 +58,7 @@ MAPTRACKER = {
 }
 
 
-def small_config(name: str = "maptracker-nuscenes", **sections: dict[str, object]) -> PredMapNetConfig:
+def small_config(name: str = "maptracker-nuscenes", **sections: Sections) -> PredMapNetConfig:
     """Return a preset with small sizes; keyword arguments change sections further."""
     values = preset(name).model_dump()
     for changes in (LITE if name == "lite" else MAPTRACKER, sections):
@@ -61,7 +66,7 @@ def small_config(name: str = "maptracker-nuscenes", **sections: dict[str, object
     return PredMapNetConfig.model_validate(values)
 
 
-def changed(values: dict[str, object], changes: dict[str, object]) -> dict[str, object]:
+def changed(values: Sections, changes: Sections) -> Sections:
     """Change some of the values, in sections as well; a section of a kind of its own takes the place of another."""
     new = {
         name: changed(values[name], value) if isinstance(value, dict) and "kind" not in value else value
@@ -97,7 +102,7 @@ class PlainBackbone(nn.Module):
         return [fine, functional.avg_pool2d(fine, 2), functional.avg_pool2d(fine, 4, ceil_mode=True)]
 
 
-def opened(module: nn.Module, seed: int = 0) -> nn.Module:
+def opened(module: Module, seed: int = 0) -> Module:
     """Give branches and biases that begin as zero the weights that training would, and switch to evaluation."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

@@ -14,7 +14,9 @@ pytestmark = pytest.mark.slow  # Images are rendered first.
 @pytest.mark.parametrize("car", CARS)
 def test_a_log_of_another_car_becomes_a_map_that_is_right(tmp_path, car):
     folder = write_log(tmp_path / car, CARS[car], 24, 2.0)
-    *_, report = mapped(folder, 2.0, 24)
+    said: list[str] = []
+    report = mapped(folder, 2.0, 12, said.append)
+    assert [int(line.split()[0]) for line in said] == [12, 24]
     assert report.frames == 24 and report.written[0].is_file()
     assert sum(report.elements.values()) > 5
     # Cameras that are drawn or described wrongly find next to nothing.

@@ -41,11 +41,12 @@ class FaultyImages(SceneView):
         frame = self.scene.frame(index)
         cameras = {camera.name: camera for camera in frame.rig}
         images = {}
-        for name, path in frame.images.items():
+        for name, stored in frame.images.items():
             shot = Shot(frame.scene, index, cameras[name], self.seed)
             images[name] = self.folder / f"{name}.png"
-            faulty = self.fault(read_image(path), shot, self.severity)[:, :, ::-1]
-            cv2.imwrite(str(images[name]), faulty, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+            image = read_image(stored) if isinstance(stored, Path) else stored
+            faulty = self.fault(image, shot, self.severity)
+            cv2.imwrite(str(images[name]), faulty[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 0])
         return replace(frame, images=images)
 
 

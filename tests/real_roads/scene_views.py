@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from mapfusion.arrays import Float
 from mapfusion.elements import GlobalMap, RegionOfInterest
+from mapfusion.georeference import Georeference
 from predmapnet.scenes import (
     STANDARD_REGION,
     Camera,
-    Float,
     Frame,
     FrameTruth,
-    Georeference,
     Instant,
     Rig,
     Scene,

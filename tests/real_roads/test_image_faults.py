@@ -16,7 +16,7 @@ def photograph() -> np.ndarray:
     random = np.random.default_rng(3)
     rows, columns = np.mgrid[: SMALL.height, : SMALL.width]
     waves = 120 + 50 * np.sin(columns / 9) * np.cos(rows / 7)
-    return (waves[..., None] + random.uniform(-15, 15, (SMALL.height, SMALL.width, 3))).astype(np.uint8)
+    return np.asarray(waves[..., None] + random.uniform(-15, 15, (SMALL.height, SMALL.width, 3))).astype(np.uint8)
 
 
 def difference(first, second) -> float:

@@ -18,6 +18,6 @@ def test_the_real_street_opens_and_its_lines_lie_in_view():
     assert len(street) == 80
     frame = street.frame(len(street) // 2)
     assert set(frame.images) == {camera.name for camera in frame.rig}
-    kinds = street.truth(frame.index, RegionOfInterest()).kinds
-    assert {ElementKind.DIVIDER, ElementKind.BOUNDARY} <= set(kinds.tolist())
+    truth = street.truth(frame.index, RegionOfInterest())
+    assert truth is not None and {ElementKind.DIVIDER, ElementKind.BOUNDARY} <= set(truth.kinds.tolist())
     assert street.georeference is not None

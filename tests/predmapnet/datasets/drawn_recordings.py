@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgpack
@@ -19,6 +20,12 @@ LATITUDE, LONGITUDE = 49.0112, 8.4229
 
 def line(name: str, values) -> str:
     return f"{name}: " + " ".join(f"{value:.12e}" for value in np.ravel(values))
+
+
+def _image(path: Path | str) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None, path
+    return image
 
 
 def clock(nanoseconds: int) -> str:
@@ -66,7 +73,7 @@ def write_kitti(log: LogScene, day, camera: str = "02"):
         (folder / "data").mkdir(parents=True)
         (folder / "timestamps.txt").write_text("\n".join(map(clock, stamps)) + "\n")
     for row, path in enumerate(paths):
-        cv2.imwrite(str(images / "data" / f"{row:010d}.png"), cv2.imread(str(path)))
+        cv2.imwrite(str(images / "data" / f"{row:010d}.png"), _image(path))
     for row, pose in enumerate(log.poses.ego_to_global):
         yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
         packet = [*geodetic(*pose[:2, 3]), 116.0 + pose[2, 3], roll, pitch, yaw, *[0.0] * 19, 4, 11, 6, 6, 6]
@@ -101,7 +108,7 @@ def write_pandaset(log: LogScene, scene):
     return scene
 
 
-def numbers_of(log: Path) -> dict:
+def numbers_of(log: Path) -> dict[str, Any]:
     """The log as numbers: see ``write_py123d_log.py``."""
     poses = read_timed_poses(log)
     rows = []
@@ -122,7 +129,7 @@ def numbers_of(log: Path) -> dict:
     return {"height": ABOVE_ROAD, "poses": rows, "cameras": cameras}
 
 
-def write_table(folder: Path, key: str, columns: dict, metadata: dict) -> None:
+def write_table(folder: Path, key: str, columns: dict[str, Any], metadata: dict[str, Any]) -> None:
     """A file of a modality, laid out as py123d 0.7.0 does."""
     table = pa.table({f"{key}.{name}": column for name, column in columns.items()})
     with pa.ipc.new_file(
@@ -134,17 +141,17 @@ def write_table(folder: Path, key: str, columns: dict, metadata: dict) -> None:
 def write_py123d(log: Path, folder: Path, codec: str = "jpeg_binary") -> Path:
     folder.mkdir()
     numbers = numbers_of(log)
+    car = {"height": 1.8, "center_to_imu_se3": [1.4, 0.0, 0.9 - numbers["height"], 1.0, 0.0, 0.0, 0.0]}
     times, poses = [row[0] for row in numbers["poses"]], [row[1:] for row in numbers["poses"]]
-    size = {"height": 1.8, "center_to_imu_se3": [1.4, 0.0, 0.9 - numbers["height"], 1.0, 0.0, 0.0, 0.0]}
-    write_table(folder, "ego_state_se3", {"timestamp_us": pa.array(times, pa.int64()), "imu_se3": poses}, size)
+    write_table(folder, "ego_state_se3", {"timestamp_us": pa.array(times, pa.int64()), "imu_se3": poses}, car)
     for name, camera in numbers["cameras"].items():
-        times, paths = zip(*camera["images"], strict=True)
-        data = [Path(path).read_bytes() if codec == "jpeg_binary" else Path(path).name for path in paths]
+        times, paths = [image[0] for image in camera["images"]], [image[1] for image in camera["images"]]
+        data: Any = [Path(path).read_bytes() if codec == "jpeg_binary" else Path(path).name for path in paths]
         if codec == "mp4":
             size = (camera["width"], camera["height"])
             video = cv2.VideoWriter(str(folder / f"camera.{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size)
             for path in paths:
-                video.write(cv2.imread(path))
+                video.write(_image(path))
             video.release()
             data = pa.array(range(len(paths)), pa.int32())
         metadata = {"camera_model": "pinhole", "camera_to_imu_se3": camera["pose"], "is_undistorted": False}

@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +25,9 @@ class MetricCase:
     frames: list[EvaluationFrame]
     predicted_rows: list[np.ndarray]
     truth_rows: list[np.ndarray]
-    inputs: dict
-    expected: dict
-    intermediates: dict
+    inputs: dict[str, Any]
+    expected: dict[str, Any]
+    intermediates: dict[str, Any]
 
     def subset(self, name: str) -> list[int]:
         return [row for row, frame in enumerate(self.frames) if name in ("all", frame.scene)]

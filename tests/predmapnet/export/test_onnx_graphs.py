@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import torch
 import predmapnet as pmn
 from predmapnet.config import PredMapNetConfig
 from predmapnet.demo_world.rig import DEMO_RIG
-from predmapnet.engines import TorchEngine
+from predmapnet.engines import Engine, TorchEngine
 from predmapnet.errors import UserError
 from predmapnet.export.engine import OnnxEngine
 from predmapnet.export.graphs import padded_state
@@ -20,7 +21,7 @@ from predmapnet.mapper import Mapper
 from predmapnet.network.calibration import calibrate
 from predmapnet.network.image_input import input_size
 from predmapnet.network.predmapnet import PredMapNet
-from predmapnet.network.state import FrameInputs, Instances
+from predmapnet.network.state import FrameInputs, Instances, StreamState
 from predmapnet.presets import preset
 from predmapnet.weights.checkpoint import Checkpoint, load_checkpoint
 from tests.predmapnet.network.paper_network import tiny_config
@@ -61,13 +62,16 @@ def rows_of(instances: Instances) -> dict[str, np.ndarray]:
 
 def assert_same_drive(checkpoint: Checkpoint, folder: Path, frames: int) -> int:
     """Compare both engines frame by frame; return the largest number of tracks that were there at once."""
-    torch_engine = TorchEngine(checkpoint.network, "cpu", Precision.FLOAT32, compiled=False)
-    onnx_engine = OnnxEngine(read_graph_folder(folder), threads=1)
-    states, most = [None, None], 0
+    engines: tuple[Engine, Engine] = (
+        TorchEngine(checkpoint.network, "cpu", Precision.FLOAT32, compiled=False),
+        OnnxEngine(read_graph_folder(folder), threads=1),
+    )
+    states: list[Any] = [None, None]
+    most = 0
     with torch.inference_mode():
         for inputs in drive(checkpoint.network.config, frames):
             (one, states[0], seen), (other, states[1], seen_too) = (
-                engine.step(inputs, state) for engine, state in zip((torch_engine, onnx_engine), states, strict=True)
+                engine.step(inputs, state) for engine, state in zip(engines, states, strict=True)
             )
             for mine, theirs in ((one.instances, other.instances), (one.detections, other.detections)):
                 wanted, found = rows_of(mine), rows_of(theirs)
@@ -150,7 +154,7 @@ def test_the_shipped_network_maps_a_whole_scene_the_same(tmp_path, name):
     export_graphs(load_checkpoint(), tmp_path / name)
     mappers = Mapper.from_checkpoint(), Mapper.from_checkpoint(NetworkOptions(weights=tmp_path / name))
     scene = pmn.open_source()[0].open("scene-0103")
-    states = [None, None]
+    states: list[StreamState | None] = [None, None]
     for index in range(len(scene)):
         maps = []
         for number, mapper in enumerate(mappers):

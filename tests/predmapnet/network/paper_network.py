@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -16,17 +17,17 @@ from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.network.state import BevFeatures, FrameInputs, FrameOutputs, Instances, StreamState
 from predmapnet.network.track_selection import instances_from_rows
 from predmapnet.presets import parse_config
-from tests.predmapnet.small_networks import opened, small_config
+from tests.predmapnet.small_networks import Sections, opened, small_config
 
 SIZES = ("paper", "lite")
 
 
-def tiny_config(size: str, **sections: dict[str, object]) -> PredMapNetConfig:
+def tiny_config(size: str, **sections: Sections) -> PredMapNetConfig:
     """Return ``paper-nuscenes`` or ``lite`` made small; keyword arguments change sections further."""
     return small_config("paper-nuscenes" if size == "paper" else "lite", **sections)
 
 
-def tiny_network(size: str, **sections: dict[str, object]) -> PredMapNet:
+def tiny_network(size: str, **sections: Sections) -> PredMapNet:
     """Return an open network without its image backbone, which takes most of the time and is not asked for here."""
     return copy.deepcopy(_built(tiny_config(size, **sections).to_json()))
 
@@ -80,7 +81,7 @@ def advance(network: PredMapNet, state: StreamState | None, outputs: FrameOutput
     return network.advance(state, outputs, kept, frame(outputs.ego_to_global))
 
 
-def one_frame_later(network: PredMapNet, tracks: int = 3, seed: int = 0, **changes: Tensor) -> StreamState:
+def one_frame_later(network: PredMapNet, tracks: int = 3, seed: int = 0, **changes: Any) -> StreamState:
     """Return the state after a first frame at ``pose()`` whose last detections became tracks 0, 1, ..."""
     outputs = decode(network, bev_levels(network.config, seed=seed), pose())
     last = outputs.query_valid.shape[1]
@@ -102,7 +103,8 @@ def attention_by_hand(part: Attention, query: Tensor, key: Tensor, value: Tensor
             share = scores.exp() / scores.exp().sum()
             rows.append(share @ v[cells, of_head])
         heads.append(torch.stack(rows))
-    return part.output(torch.cat(heads, dim=1))
+    found: Tensor = part.output(torch.cat(heads, dim=1))
+    return found
 
 
 def place_code(x: float, y: float) -> Tensor:

@@ -72,7 +72,7 @@ def painted_scenes(
     return TrainingScenes(scenes, [1.0] * len(scenes), config)
 
 
-def _truth(lines: list, pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:
+def _truth(lines: list[tuple[int, np.ndarray]], pose: np.ndarray, roi: RegionOfInterest) -> FrameTruth:
     pieces = [
         (kind, part, number)
         for number, (kind, points) in enumerate(lines)

@@ -77,7 +77,7 @@ def odometry(parent: str, child: str, time: int, pose: Float) -> Any:
     )
 
 
-def camera_info(entry: dict, time: int, frame: str) -> Any:
+def camera_info(entry: dict[str, Any], time: int, frame: str) -> Any:
     k = entry["intrinsics"]
     matrix = np.array([k["fx"], 0.0, k["cx"], 0.0, k["fy"], k["cy"], 0.0, 0.0, 1.0])
     model = {"pinhole": "plumb_bob", "fisheye": "equidistant"}.get(entry["model"], entry["model"])
@@ -100,7 +100,7 @@ def compressed(data: bytes, time: int, frame: str, stated: str = "jpeg") -> Any:
     return T.CompressedImage(header=header(time, frame), format=stated, data=np.frombuffer(data, dtype=np.uint8))
 
 
-def raw(image: Float, encoding: str, time: int, frame: str, padding: int = 0) -> Any:
+def raw(image: np.ndarray, encoding: str, time: int, frame: str, padding: int = 0) -> Any:
     """An image ``(height, width[, channels])`` of bytes, its rows ``padding`` bytes longer than they need to be."""
     rows = np.pad(image.reshape(len(image), -1), ((0, 0), (0, padding)))
     height, width = image.shape[:2]
@@ -112,7 +112,7 @@ def tf(transforms: Iterable[Any]) -> Any:
     return T.TFMessage(transforms=list(transforms))
 
 
-def pose_of(entry: dict) -> Float:
+def pose_of(entry: dict[str, Any]) -> Float:
     w, x, y, z = entry["camera_to_ego"]["rotation_wxyz"]
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ START = 1_500_000_000_000_000_000
 ABOVE_ROAD = 0.3
 TEXEL = 0.04
 """Metres."""
-Entry = dict
+Entry = dict[str, Any]
 
 
 def entry(yaw: float, width: int = 320, height: int = 192, focal: float = 180.0, pitch: float = 0.0, **lens) -> Entry:
@@ -77,7 +78,8 @@ def draw(rays: Float, camera_to_ego: Float, pose: Float, texture: Float) -> Floa
     angle = np.arctan2(there[..., 1], there[..., 0])
     far = np.stack([angle, there[..., 2] / np.linalg.norm(there[..., :2], axis=-1)], axis=-1) * 400
     place = np.where(down[..., None], road, far) % 1024
-    return cv2.remap(texture, place.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    x, y = np.moveaxis(place.astype(np.float32), -1, 0)
+    return np.asarray(cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
 def write_log(
