@@ -3,14 +3,16 @@
 ``drives``
     One run of ``lite`` over data that are as different as they get: two demo towns with different cars, an Argoverse 2
     log in its own layout with its seven cameras (drawn by the renderer), and the real street, read as anybody's log.
+    Streams grow while the temporal stage runs, and long ones are harder; so its losses are measured on the same
+    streams of full length, before and after.
 ``frame``
     ``lite``, from the shipped weights and without augmentation, on a single frame of the real street, until it knows it
     by heart: chamfer AP at 1.5 m of the classes in the frame.
 ``paper``
     ``paper-nuscenes`` with small images, its last stage with all losses, on one clip of a demo town.
 
-Prints each loss, mean of the first and of the last tenth of the steps in which there is one. What is learned is thrown
-away. Reads ``$PREDMAPNET_REFERENCE``.
+Prints each loss, mean of the first and of the last tenth of the steps in which there is one (temporal: before, after).
+What is learned is thrown away. Reads ``$PREDMAPNET_REFERENCE``.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import repeat
+from itertools import islice, repeat
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +35,17 @@ from predmapnet.errors import UserError
 from predmapnet.evaluation.chamfer_ap import chamfer_average_precision
 from predmapnet.evaluation.frames import EvaluationFrame
 from predmapnet.frame_cache.prepare import DataOptions, DataSet, prepare_data
-from predmapnet.frame_cache.scene_cache import CachedScene
+from predmapnet.frame_cache.scene_cache import CachedScene, TrainingScenes
 from predmapnet.network.predmapnet import PredMapNet
 from predmapnet.presets import preset
 from predmapnet.runs.train import RunOptions, train_network
 from predmapnet.training.data.batches import StreamSegment, collate_frames
+from predmapnet.training.features import fill_features
+from predmapnet.training.instants import StageTraining
 from predmapnet.training.loop import LoopSettings, Trainer
 from predmapnet.training.plan import PlanOptions, plan_stages
 from predmapnet.training.settings import LITE_STAGES, NUSCENES_STAGES
+from predmapnet.training.stage_data import StageData
 from predmapnet.training.validation import map_frames
 from predmapnet.weights.checkpoint import load_checkpoint
 from predmapnet.weights.files import SHIPPED
@@ -52,13 +57,15 @@ OWN_CAMERAS = "7fab2350-7eaf-3b7e-a39d-6937a4c1bede"
 LOG_FRAMES, LOG_SCALE = 12, 0.25
 STREET_FRAME = 12
 """At 2 Hz; the car drives by then."""
+FULL_STREAMS = 40
+"""Steps over which losses on full streams are measured; those count in which all streams have begun."""
 SMALL_IMAGES = (160, 96)
 OFTEN = LoopSettings(log_steps=1, checkpoint_minutes=1e6)
 NOT_LOSSES = ("lr", "norm", "seconds", "cpu_seconds", "seconds_per_step", "frames", "step", "stage")
 Say = Callable[[str], None]
 
 
-class Repeated:
+class Repeated(StageData):
     """The same segment at every step."""
 
     def __init__(self, segment: StreamSegment) -> None:
@@ -89,11 +96,33 @@ def tell(folder: Path, say: Say) -> bool:
     fell = True
     for stage in dict.fromkeys(line["stage"] for line in lines):
         own = [line for line in lines if line["stage"] == stage]
-        say(f"{stage}, {len(own)} steps{'first tenth':>20}{'last tenth':>12}")
-        for name, (first, last) in learned(own).items():
-            say(f"  {name:24}{first:12.4f}{last:12.4f}{'' if last < first else '   NOT FALLEN'}")
-            fell &= last < first
+        fell &= told(f"{stage}, {len(own)} steps", "first tenth", "last tenth", learned(own), say)
     return fell
+
+
+def told(title: str, first: str, last: str, losses: Mapping[str, tuple[float, float]], say: Say) -> bool:
+    """Say what each loss was and has become; return whether all have fallen."""
+    say(f"{title:26}{first:>12}{last:>12}")
+    for name, (before, after) in losses.items():
+        say(f"  {name:24}{before:12.4f}{after:12.4f}{'' if after < before else '   NOT FALLEN'}")
+    return all(after < before for before, after in losses.values())
+
+
+@torch.no_grad()
+def on_full_streams(network: PredMapNet, scenes: TrainingScenes, folder: Path) -> dict[str, float]:
+    """Mean losses of the temporal stage on the same streams of full length, whatever the network."""
+    stage = LITE_STAGES[1]
+    (planned,) = plan_stages([stage], sum(map(len, scenes.scenes)), PlanOptions())
+    store = fill_features(network, scenes, folder, 0, 1, lambda _line: None)
+    data = StageData(planned, scenes, seed=0, store=store)
+    training = StageTraining(network.train(), stage)
+    torch.manual_seed(0)
+    lines = []
+    for step, segment in enumerate(islice(data.segments(stage.growth_steps), FULL_STREAMS)):
+        terms = training(segment, step)
+        if step >= stage.longest // stage.frames:  # All streams have begun by then.
+            lines.append({name: float(term) for name, term in terms.items()})
+    return {name: float(np.mean([line[name] for line in lines if line[name] > 0])) for name in lines[0]}
 
 
 def drives(folder: Path, steps: int, say: Say) -> bool:
@@ -102,10 +131,16 @@ def drives(folder: Path, steps: int, say: Say) -> bool:
     write_with_images(logs / OWN_CAMERAS, folder / "av2", LOG_FRAMES, LOG_SCALE)
     sets = (DataSet("demo"), DataSet("argoverse2", folder / "av2"), DataSet("log", street))
     data = DataOptions(sets, default_cache() / "training", towns=2, validation=0)
-    options = RunOptions(preset("lite"), data, folder / "run", loop=OFTEN, initial=SHIPPED)
-    rate = 3e-4  # It begins with weights that know something.
-    train_network(replace(options, plan=PlanOptions(steps=steps, learning_rate=rate)), lambda line: None)
-    return tell(folder / "run", say)
+    plan = PlanOptions(steps=steps, learning_rate=3e-4)  # It begins with weights that know something.
+    single = RunOptions(preset("lite"), data, folder / "single", "single", plan, OFTEN, initial=SHIPPED)
+    seen = train_network(single, lambda line: None)
+    fell = tell(single.folder, say)
+    after = train_network(replace(single, folder=folder / "run", stage="temporal", initial=seen), lambda line: None)
+    assert seen is not None and after is not None, "nobody interrupts"
+    scenes = prepare_data(data, preset("lite"), 1, lambda _line: None)[0]
+    began, ended = (on_full_streams(load_checkpoint(path).network, scenes, folder / "run") for path in (seen, after))
+    losses = {name: (value, ended[name]) for name, value in began.items()}
+    return told(f"temporal, {steps} steps", "before", "after", losses, say) and fell
 
 
 def frame(folder: Path, steps: int, say: Say) -> bool:
@@ -148,8 +183,8 @@ def paper(folder: Path, steps: int, say: Say) -> bool:
     clip = StreamSegment([collate_frames([scene.frame(number)], config) for number in (4, 6)])
     torch.manual_seed(0)
     network = PredMapNet(config)
-    torch.nn.init.constant_(network.map_decoder.classify.bias, 0.0)  # Tracks from the first step on.
-    stage = replace(NUSCENES_STAGES[2], clips=replace(NUSCENES_STAGES[2].clips, frames=len(clip.instants)))
+    torch.nn.init.zeros_(network.map_decoder.get_parameter("classify.bias"))  # Tracks from the first step on.
+    stage = replace(NUSCENES_STAGES[2], frames=len(clip.instants))
     stage = replace(stage, optimiser=replace(stage.optimiser, warmup_steps=max(1, steps // 5)), memory_from_step=0)
     (planned,) = plan_stages([stage], 1, PlanOptions(batch=1, steps=steps))
     trainer = Trainer(Fabric(accelerator="cpu", devices=1), network, folder / "run", OFTEN, say)
