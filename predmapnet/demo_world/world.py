@@ -2,19 +2,24 @@
 
 A :class:`VectorMap` and a :class:`Trajectory` come from a town generator or from a real data set;
 :func:`predmapnet.demo_world.street.dressing.dress` turns them into a :class:`World`, which the renderer draws.
-Coordinates are metres in the global frame; the road surface is the plane z = 0.
+Coordinates are metres in the global frame. The map lies in the plane z = 0, and so does the road surface unless the world
+has a terrain, which raises all that is at (x, y) by the height of the ground there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from shapely import Polygon
 
 from mapfusion.arrays import Float
+
+if TYPE_CHECKING:
+    from predmapnet.demo_world.terrain import Terrain
 
 
 class LineStyle(StrEnum):
@@ -150,7 +155,7 @@ class Solids:
 
     Attributes:
         shape: ``(n,)`` of ``box``, ``cylinder``, ``ellipsoid`` (crowns of trees).
-        centre: ``(n, 3) float64``, metres.
+        centre: ``(n, 3) float64``, metres; z above the ground below the centre.
         size: ``(n, 3) float64``: length, width, height, metres.
         yaw: ``(n,) float64``, radians.
         colour: ``(n, 3) float64``, linear RGB in [0, 1].
@@ -201,7 +206,10 @@ class Clutter:
 
 @dataclass(frozen=True)
 class World:
-    """Everything that the renderer needs to draw one scene. Deterministic in ``seed``."""
+    """Everything that the renderer needs to draw one scene. Deterministic in ``seed``.
+
+    The trajectory stands on the terrain; None is flat ground.
+    """
 
     name: str
     seed: int
@@ -211,3 +219,4 @@ class World:
     surfaces: tuple[Surface, ...] = field(repr=False)
     solids: Solids = field(repr=False)
     clutter: Clutter = field(default_factory=Clutter, repr=False)
+    terrain: Terrain | None = field(default=None, repr=False)

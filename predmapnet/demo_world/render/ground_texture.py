@@ -209,7 +209,7 @@ class _Darkness(NamedTuple):
 
 def _darkness(world: World, light: Light) -> _Darkness:
     standing = ~world.solids.velocity.any(axis=1) & world.solids.always
-    shadows = shadow_polygons(world.solids, standing, light.sun_direction) if light.sun.any() else []
+    shadows = shadow_polygons(world.solids, standing, light.sun_direction, world.terrain) if light.sun.any() else []
     if light.sun.any():
         shadows = [*shadows, *world.clutter.shadows]
     return _Darkness([*contact_polygons(world.solids, standing), *world.clutter.stains], shadows)

@@ -11,6 +11,16 @@ from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import kernel, part
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.raster import Vector, View, ZBuffer, ball_depth, pixel_ray
+from predmapnet.demo_world.render.relief import (
+    Footing,
+    Relief,
+    facing_of,
+    first_guess,
+    footing,
+    height_over_foot,
+    mirrored,
+    stand_of,
+)
 from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
 from predmapnet.demo_world.street.looks import Light
 
@@ -65,15 +75,20 @@ def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
 
 
 @part
-def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient: float, facing: float) -> Colour:
-    """Irradiance from the sun, the sky, headlights (``facing``: cosine towards the car) and lamps."""
+def _lit(
+    around: Surroundings, x: float, y: float, z: float, height: float, sun: float, ambient: float, facing: float
+) -> Colour:
+    """Irradiance from the sun, the sky, headlights (``facing``: cosine towards the car) and lamps.
+
+    ``height`` is that above the ground.
+    """
     light = around.light
     lamps = 0.0
     if light.lamps > 0:
         lamps = light.lamps * _lamp_light(around, x, y)
     beam = 0.0
     if light.headlights > 0:
-        beam = headlight(light, around.global_to_ego, x, y, z) * facing
+        beam = headlight(light, around.global_to_ego, x, y, z, height) * facing
     return (
         light.sun[0] * sun + light.ambient[0] * ambient + beam + 1.0 * lamps,
         light.sun[1] * sun + light.ambient[1] * ambient + 0.96 * beam + 0.72 * lamps,
@@ -83,22 +98,26 @@ def _lit(around: Surroundings, x: float, y: float, z: float, sun: float, ambient
 
 @part
 def _ground_colour(
-    around: Surroundings, view: View, px: float, py: float, ray: Vector, dynamic: float, most: int
+    around: Surroundings, relief: Relief | None, view: View, ray: Vector, foot: Footing, dynamic: float, most: int
 ) -> Colour:
-    """Radiance of the ground seen at pixel position (px, py) along ``ray`` (camera depth 1)."""
-    rotation, light = view.rotation, around.light
-    depth = -view.position[2] / ray[2]
+    """Radiance of the ground that a pixel sees along ``ray`` (camera depth 1) at ``foot``."""
+    rotation, light, depth = view.rotation, around.light, foot.depth
     x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
-    tilt_u, tilt_v = rotation[2, 0] / view.focal_x / ray[2], rotation[2, 1] / view.focal_y / ray[2]
+    along, right, down, upright = facing_of(relief, view, ray, foot)
+    tilt_u, tilt_v = right / view.focal_x / along, down / view.focal_y / along
     ux = depth * (rotation[0, 0] / view.focal_x - ray[0] * tilt_u)
     uy = depth * (rotation[1, 0] / view.focal_x - ray[1] * tilt_u)
     vx = depth * (rotation[0, 1] / view.focal_y - ray[0] * tilt_v)
     vy = depth * (rotation[1, 1] / view.focal_y - ray[1] * tilt_v)
     red, green, blue, shade = read_ground(around.fine, around.coarse, around.white, x, y, ux, uy, vx, vy, most)
     distance = depth * np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-    sun = light.sun_direction[2] * shade * (1.0 if dynamic > 0.99 else dynamic)
-    facing = min(1.0, 0.25 + 3.0 * view.position[2] / distance)
-    lit = _lit(around, x, y, 0.0, sun, (0.75 + 0.25 * shade) * (0.25 + 0.75 * dynamic), facing)
+    sun, z, eye = light.sun_direction[2], 0.0, view.position[2]
+    if relief is not None:
+        sun = max(0.0, sun - foot.east * light.sun_direction[0] - foot.north * light.sun_direction[1]) * upright
+        z, eye = view.position[2] + depth * ray[2], -depth * along * upright
+    sun *= shade * (1.0 if dynamic > 0.99 else dynamic)
+    facing = min(1.0, 0.25 + 3.0 * eye / distance)
+    lit = _lit(around, x, y, z, 0.0, sun, (0.75 + 0.25 * shade) * (0.25 + 0.75 * dynamic), facing)
     return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), distance)
 
 
@@ -117,30 +136,33 @@ def _sky_mirror(
 
 
 @part
-def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth: float, ray: Vector) -> Colour:
+def _face_colour(
+    around: Surroundings, relief: Relief | None, mesh: Mesh, view: View, face: int, depth: float, ray: Vector
+) -> Colour:
     light = around.light
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
     nx, ny, nz = mesh.normals[face, 0], mesh.normals[face, 1], mesh.normals[face, 2]
     material, owner = mesh.materials[face], mesh.owners[face]
+    height = height_over_foot(relief, owner, z)
     red, green, blue = mesh.colours[face, 0], mesh.colours[face, 1], mesh.colours[face, 2]
     glass = lit_window = 0.0
     if material == 1:
         along = (y - mesh.corners[face, 0, 1]) * nx - (x - mesh.corners[face, 0, 0]) * ny if abs(nz) < 0.5 else 0.0
         blur = depth / view.focal_x / max(0.15, -(ray[0] * nx + ray[1] * ny) / length)
         red, green, blue, glass, lit_window = facade(
-            light, around.fractal, around.styles, owner, along, z, blur, red, green, blue
+            light, around.fractal, around.styles, owner, along, height, blur, red, green, blue
         )
     elif material == 3 or material == 10 or material == 0:
         dirt = 0.85 + 0.3 * smooth_noise(around.fractal, (x - y) * 9, (y + z) * 9)
         red, green, blue = red * dirt, green * dirt, blue * dirt
     sun = max(0.0, nx * light.sun_direction[0] + ny * light.sun_direction[1] + nz * light.sun_direction[2])
     shadow = around.sunlit[owner]
-    sun *= shadow + (1 - shadow) * min(1.0, max(0.0, (z - 3.0) / 8.0))
+    sun *= shadow + (1 - shadow) * min(1.0, max(0.0, (height - 3.0) / 8.0))
     # Close to the ground less of the sky is seen, but light comes back from the road.
-    ambient = (0.62 + 0.38 * nz) * (0.6 + 0.4 * min(1.0, z / 1.2))
+    ambient = (0.62 + 0.38 * nz) * (0.6 + 0.4 * min(1.0, height / 1.2))
     towards = -(nx * ray[0] + ny * ray[1] + nz * ray[2]) / length
-    lit = _lit(around, x, y, z, sun, ambient, max(0.0, towards))
+    lit = _lit(around, x, y, z, height, sun, ambient, max(0.0, towards))
     colour = (red * lit[0], green * lit[1], blue * lit[2])
     if material == 4 or material == 5 or glass > 0.02:
         mirror = _sky_mirror(around, ray, length, nx, ny, nz)
@@ -166,7 +188,9 @@ def _face_colour(around: Surroundings, mesh: Mesh, view: View, face: int, depth:
 
 
 @part
-def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth: float, ray: Vector) -> Colour:
+def _ball_colour(
+    around: Surroundings, relief: Relief | None, mesh: Mesh, view: View, index: int, depth: float, ray: Vector
+) -> Colour:
     light, balls = around.light, mesh.balls
     length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
     x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
@@ -196,19 +220,21 @@ def _ball_colour(around: Surroundings, mesh: Mesh, view: View, index: int, depth
         shine = 0.35 * shine + 0.35
         shine *= 0.5 + clump
         ambient *= 0.55 + 0.45 * min(1.0, max(0.0, (z - balls[index, 2]) / balls[index, 5] + 1.0))
-    lit = _lit(around, x, y, z, max(0.0, shine), ambient, 0.7)
+    height = height_over_foot(relief, mesh.ball_owners[index], z)
+    lit = _lit(around, x, y, z, height, max(0.0, shine), ambient, 0.7)
     return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), depth * length)
 
 
 @kernel
 def shade_image(
-    around: Surroundings, mesh: Mesh, view: View, samples: int, most: int, solids: ZBuffer, dynamic: Byte,
-    found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
+    around: Surroundings, relief: Relief | None, mesh: Mesh, view: View, samples: int, most: int, solids: ZBuffer,
+    dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
 ) -> None:  # fmt: skip
     """Shade all pixels; each face in a pixel is shaded once, weighted by the samples that it covers.
 
     Args:
         around, mesh, view: what is seen.
+        relief: slopes of the ground; None compiles loops for flat ground.
         samples: per pixel and direction.
         most: largest number of ground samples along a footprint.
         solids: z-buffer.
@@ -221,6 +247,8 @@ def shade_image(
     faces = len(mesh.counts)
     weight, sum_x, sum_y, close = scratch[0], scratch[1], scratch[2], scratch[3]
     each = 1.0 / (samples * samples)
+    stand = stand_of(relief, view.position)
+    foot = first_guess(view, stand)
     for row in range(view.height):
         for column in range(view.width):
             first = solids.ids[row * samples, column * samples]
@@ -259,24 +287,25 @@ def shade_image(
                 ray = pixel_ray(view, x, y)
                 here = np.inf
                 if number < 0:
-                    if ray[2] < -1e-5:
-                        colour = _ground_colour(around, view, x, y, ray, dynamic[row, column] / 255.0, most)
+                    foot = footing(relief, view, stand, ray, foot)
+                    here = foot.depth
+                    if here < np.inf:
+                        colour = _ground_colour(around, relief, view, ray, foot, dynamic[row, column] / 255.0, most)
                         share_of_ground += part
-                        here = -view.position[2] / ray[2]
                     else:
                         length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
                         colour = sky(around.light, around.clouds, ray[0] / length, ray[1] / length, ray[2] / length)
                 elif number < faces:
                     plane = solids.planes[number]
                     shaded = 1 / max(plane[0] * x + plane[1] * y + plane[2], 1e-6)
-                    colour = _face_colour(around, mesh, view, number, shaded, ray)
+                    colour = _face_colour(around, relief, mesh, view, number, shaded, ray)
                     here = plane[0] * (column + 0.5) + plane[1] * (row + 0.5) + plane[2]
                     here = 1 / here if here > 0.5 * close[slot] and here < 2 * close[slot] else 1 / close[slot]
                 else:
                     shaded = ball_depth(mesh.balls, number - faces, view, x, y)
                     if shaded <= 0:
                         shaded = 1 / close[slot]
-                    colour = _ball_colour(around, mesh, view, number - faces, shaded, ray)
+                    colour = _ball_colour(around, relief, mesh, view, number - faces, shaded, ray)
                     here = shaded if same else ball_depth(mesh.balls, number - faces, view, column + 0.5, row + 0.5)
                     if here <= 0:
                         here = 1 / close[slot]
@@ -289,30 +318,36 @@ def shade_image(
 
 
 @kernel
-def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image: Float32) -> None:
+def mirror_in_wet(
+    around: Surroundings, relief: Relief | None, view: View, ground_share: Float32, image: Float32
+) -> None:
     """Add to wet ground what it mirrors, smeared vertically as rough water does; see :func:`shade_image`."""
     light, rotation = around.light, view.rotation
+    stand = stand_of(relief, view.position)
+    foot = first_guess(view, stand)
     for row in range(view.height):
         for column in range(view.width):
             if ground_share[row, column] < 0.01:
                 continue
             ray = pixel_ray(view, column + 0.5, row + 0.5)
-            if ray[2] > -1e-5:
+            foot = footing(relief, view, stand, ray, foot)
+            depth = foot.depth
+            if depth == np.inf:
                 continue
+            along, _, _, upright = facing_of(relief, view, ray, foot)
             length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-            depth = -view.position[2] / ray[2]
             x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
             puddle = smooth_noise(around.fractal, x * 1.7, y * 1.7)
             smooth = light.wetness * (0.35 + 0.65 * min(1.0, max(0.0, (puddle - 0.45) * 4)))
-            fresnel = 0.02 + 0.98 * max(0.0, 1 + ray[2] / length) ** 5
+            fresnel = 0.02 + 0.98 * max(0.0, 1 + along * upright / length) ** 5
             share = smooth * fresnel * ground_share[row, column]
             red = green = blue = 0.0
             for step in range(4):
                 # The ripple tilts the mirrored ray up and down.
-                lift = -ray[2] * (0.55 + 0.45 * step)
-                local_x = rotation[0, 0] * ray[0] + rotation[1, 0] * ray[1] + rotation[2, 0] * lift
-                local_y = rotation[0, 1] * ray[0] + rotation[1, 1] * ray[1] + rotation[2, 1] * lift
-                local_z = rotation[0, 2] * ray[0] + rotation[1, 2] * ray[1] + rotation[2, 2] * lift
+                mx, my, mz = mirrored(relief, ray, along, foot, 0.55 + 0.45 * step)
+                local_x = rotation[0, 0] * mx + rotation[1, 0] * my + rotation[2, 0] * mz
+                local_y = rotation[0, 1] * mx + rotation[1, 1] * my + rotation[2, 1] * mz
+                local_z = rotation[0, 2] * mx + rotation[1, 2] * my + rotation[2, 2] * mz
                 seen = False
                 if local_z > 0.05:
                     i = int(local_y / local_z * view.focal_y + view.centre_y)
@@ -321,8 +356,8 @@ def mirror_in_wet(around: Surroundings, view: View, ground_share: Float32, image
                         red, green, blue = red + image[i, j, 0], green + image[i, j, 1], blue + image[i, j, 2]
                         seen = True
                 if not seen:
-                    norm = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + lift * lift)
-                    colour = sky(light, around.clouds, ray[0] / norm, ray[1] / norm, lift / norm)
+                    norm = np.sqrt(mx * mx + my * my + mz * mz)
+                    colour = sky(light, around.clouds, mx / norm, my / norm, mz / norm)
                     red, green, blue = red + colour[0], green + colour[1], blue + colour[2]
             image[row, column, 0] += share * (red / 4 - image[row, column, 0])
             image[row, column, 1] += share * (green / 4 - image[row, column, 1])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mapfusion.arrays import Float
 from predmapnet.demo_world.render.mesh import Mesh
+from predmapnet.demo_world.render.relief import Relief, meet_along
 from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import LIDAR_TO_EGO
 from predmapnet.scenes import Camera
@@ -24,11 +25,14 @@ _SIDE = 640
 """Pixels of each of the four square images in which rays look up what they meet (about 0.16 degrees)."""
 
 
-def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float) -> Float:
+def _hit_distance(
+    mesh: Mesh, relief: Relief | None, ids: NDArray[np.int32], origin: Float, rays: Float
+) -> Float:
     """Exact distance from ``origin`` along unit ``rays`` (n, 3) to the face or ellipsoid of each id; -1 is ground."""
     distance = np.full(len(rays), np.inf)
-    down = (ids < 0) & (rays[:, 2] < 0)
-    distance[down] = -origin[2] / rays[down, 2]
+    if relief is None:
+        down = (ids < 0) & (rays[:, 2] < 0)
+        distance[down] = -origin[2] / rays[down, 2]
     flat = (ids >= 0) & (ids < len(mesh.counts))
     normals, corners = mesh.normals[ids[flat]], mesh.corners[ids[flat], 0]
     facing = np.einsum("ni,ni->n", normals, rays[flat])
@@ -46,6 +50,8 @@ def _hit_distance(mesh: Mesh, ids: NDArray[np.int32], origin: Float, rays: Float
         square, half = (ray * ray).sum(axis=1), (ray * start).sum(axis=1)
         inside = half**2 - square * ((start * start).sum(axis=1) - 1)
         distance[round_ones] = np.where(inside >= 0, (-half - np.sqrt(np.maximum(inside, 0))) / square, np.inf)
+    if relief is not None:
+        meet_along(relief, origin, rays, distance)
     return distance
 
 
@@ -101,7 +107,7 @@ def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EG
         buffer = renderer.rasterise(mesh, renderer.view(eye, frame_index), 1).ids
         chosen = sector.chosen
         ids[chosen] = buffer[sector.rows, sector.columns]
-        distance[chosen] = _hit_distance(mesh, ids[chosen], origin, rays_global[chosen])
+        distance[chosen] = _hit_distance(mesh, renderer.relief, ids[chosen], origin, rays_global[chosen])
     generator = np.random.default_rng([renderer.world.seed, 53, frame_index])
     noisy = distance + generator.normal(0, 0.015, len(distance))
     kept = (distance > 1.0) & (distance < RANGE)

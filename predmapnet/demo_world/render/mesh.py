@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapfusion.arrays import Float, Integer
+from predmapnet.demo_world.terrain import Terrain
 from predmapnet.demo_world.world import Solids
 
 Corners = list[tuple[float, float, float]]
@@ -229,8 +230,31 @@ def _select(solids: Solids, row: int) -> _Template:
     return _prism(8) if solids.shape[row] == "cylinder" else _box()
 
 
-def build_mesh(solids: Solids, rows: Integer) -> Mesh:
-    """Turn rows ``(k,)`` of solids into faces; ``owners`` of the mesh refer to rows of ``solids``."""
+_FOUNDATION = 0.15
+"""Metres that what stands on a slope reaches below the lowest ground along its outline."""
+
+
+def _raise(corners: Float, owners: Integer, solids: Solids, terrain: Terrain) -> None:
+    """Put corners ``(f, 8, 3)`` of solids on the ground: vehicles lie along it, the rest stands upright on its foot."""
+    kept, owner = np.unique(owners, return_inverse=True)
+    foot, size = solids.centre[kept, :2], solids.size[kept]
+    height, slope = terrain.heights(foot), terrain.gradients(foot)
+    low = (solids.centre[kept, 2] - size[:, 2] / 2)[owner][:, None]
+    vehicle = solids.texture[owners] == "vehicle"
+    lying = ((corners[..., :2] - foot[owner][:, None]) * slope[owner][:, None]).sum(axis=-1)
+    turned = np.stack([np.cos(solids.yaw[kept]), np.sin(solids.yaw[kept])], axis=1)
+    along, across = turned * size[:, :1] / 2, np.stack([-turned[:, 1], turned[:, 0]], axis=1) * size[:, 1:2] / 2
+    outline = [foot + i * along + j * across for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    lowest = (np.min([terrain.heights(point) for point in outline], axis=0) - height - _FOUNDATION)[owner][:, None]
+    founded = (low < 0.05) & (corners[..., 2] < low + 1e-6)
+    corners[..., 2] += height[owner][:, None] + np.where(vehicle[:, None], lying, np.where(founded, lowest, 0.0))
+
+
+def build_mesh(solids: Solids, rows: Integer, terrain: Terrain | None = None) -> Mesh:
+    """Turn rows ``(k,)`` of solids into faces; ``owners`` of the mesh refer to rows of ``solids``.
+
+    A terrain raises them by the height of the ground at their middles.
+    """
     flat = [int(row) for row in rows if solids.shape[row] != "ellipsoid"]
     templates = [_select(solids, row) for row in flat]
     repeats = np.array([len(template.counts) for template in templates], dtype=np.int64)
@@ -250,6 +274,8 @@ def build_mesh(solids: Solids, rows: Integer) -> Mesh:
     corners[..., 1] = sine * local[..., 0] + cosine * local[..., 1]
     corners[..., 2] = local[..., 2]
     corners += solids.centre[owners][:, None, :]
+    if terrain is not None and flat:
+        _raise(corners, owners, solids, terrain)
     # Newell's rule: also right for faces whose first corners lie on one line.
     following = np.where(
         np.arange(MOST_CORNERS)[None, :] + 1 < counts[:, None], (np.arange(MOST_CORNERS)[None, :] + 1) % MOST_CORNERS, 0
@@ -269,7 +295,10 @@ def build_mesh(solids: Solids, rows: Integer) -> Mesh:
 
     round_ones = np.array([int(row) for row in rows if solids.shape[row] == "ellipsoid"], dtype=np.int64)
     yaw = solids.yaw[round_ones]
-    balls = np.column_stack([solids.centre[round_ones], solids.size[round_ones] / 2, np.cos(yaw), np.sin(yaw)])
+    centre = solids.centre[round_ones]
+    if terrain is not None:
+        centre[:, 2] += terrain.heights(centre[:, :2])
+    balls = np.column_stack([centre, solids.size[round_ones] / 2, np.cos(yaw), np.sin(yaw)])
     return Mesh(
         corners, counts, normals, materials, owners, colours,
         balls, own[round_ones], round_ones, solids.colour[round_ones],

@@ -17,6 +17,7 @@ from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mi
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, ZBuffer, draw_balls, draw_faces, draw_mask
+from predmapnet.demo_world.render.relief import Relief, hide_behind_ground, relief_of
 from predmapnet.demo_world.render.response import Response
 from predmapnet.demo_world.render.shading import facade_styles
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
@@ -39,11 +40,13 @@ class _Moment:
 
     Attributes:
         mesh: all solids.
+        relief: slopes of the ground, None where there are none.
         darkness: corners ``(k, 8, 3)`` and counts ``(k,)`` of outlines on the ground that what moves darkens, and the
             light that is left there, [0, 255].
     """
 
     mesh: Mesh
+    relief: Relief | None
     darkness: tuple[tuple[Float, NDArray[np.int64], int], ...]
 
 
@@ -96,7 +99,8 @@ class Renderer:
         self._ground = paint_ground(world, self.light, texel)
         solids = world.solids
         self._moving = solids.velocity.any(axis=1) | ~solids.always
-        self._standing_mesh = build_mesh(solids, np.flatnonzero(~self._moving))
+        self._standing_mesh = build_mesh(solids, np.flatnonzero(~self._moving), world.terrain)
+        self.relief = None if world.terrain is None else relief_of(world.terrain, solids.centre)
         self._sunlit = np.ones(len(solids.shape), dtype=np.float32)
         if self.light.sun.any():
             self._sunlit[:] = self._shadow_at(self._ground[0], solids.centre[:, :2], solids)
@@ -140,16 +144,18 @@ class Renderer:
         """Return the mesh of a key frame, the solids in place, and the rows of those that move."""
         placed, present = self.solids_at(frame_index)
         moving = present[self._moving[present]]
-        return join(self._standing_mesh, build_mesh(placed, moving)), placed, moving
+        return join(self._standing_mesh, build_mesh(placed, moving, self.world.terrain)), placed, moving
 
     def _moment(self, frame_index: int) -> _Moment:
         """Return what all cameras share at a key frame."""
         mesh, placed, moving = self.mesh_at(frame_index)
+        terrain = self.world.terrain
+        relief = None if terrain is None else relief_of(terrain, placed.centre)
         chosen = np.zeros(len(placed.shape), dtype=bool)
         chosen[moving] = True
         layers: list[tuple[list[Float], int]] = []
         if self.light.sun.any():
-            layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction)], 90))
+            layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction, terrain)], 90))
         layers.append(([polygon for polygon, _ in contact_polygons(placed, chosen)], 30))
         darkness = []
         for polygons, value in layers:
@@ -161,9 +167,11 @@ class Renderer:
                     np.linspace(0, len(polygon), min(len(polygon), MOST_CORNERS), endpoint=False).astype(int)
                 ]
                 corners[row, : len(kept), :2] = kept
+                if terrain is not None:
+                    corners[row, : len(kept), 2] = terrain.heights(kept)
                 counts[row] = len(kept)
             darkness.append((corners, counts, value))
-        return _Moment(mesh, tuple(darkness))
+        return _Moment(mesh, relief, tuple(darkness))
 
     @staticmethod
     def _dynamic_mask(view: View, moment: _Moment) -> NDArray[np.uint8]:
@@ -190,6 +198,8 @@ class Renderer:
         leafy = (mesh.ball_materials == Material.FOLIAGE).astype(np.int64)
         order = np.argsort(((mesh.balls[:, :3] - view.position) ** 2).sum(axis=1))
         draw_balls(mesh.balls, leafy, order, len(mesh.counts), view, samples, self._leaves, nearness, ids)
+        if self.relief is not None:
+            hide_behind_ground(self.relief, view, samples, nearness, ids)
         return ZBuffer(nearness, ids, planes)
 
     def render(self, camera: Camera, frame_index: int) -> RenderedImage:
@@ -213,9 +223,11 @@ class Renderer:
         depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
         dynamic = self._dynamic_mask(view, moment)
         found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
-        shade_image(around, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth, ground_share)
+        shade_image(
+            around, moment.relief, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth, ground_share
+        )
         if self.light.wetness > 0:
-            mirror_in_wet(around, view, ground_share, image)
+            mirror_in_wet(around, moment.relief, view, ground_share, image)
         return RenderedImage(self._develop(image, camera, frame_index), depth)
 
     def _develop(self, image: NDArray[np.float32], camera: Camera, frame_index: int) -> NDArray[np.uint8]:

@@ -253,8 +253,11 @@ def facade(
 
 
 @part
-def headlight(light: Light, view_car: Float, x: float, y: float, z: float) -> float:
-    """Irradiance of the ego car's lamps at a point of the global frame; ``view_car`` is global to ego (4, 4)."""
+def headlight(light: Light, view_car: Float, x: float, y: float, z: float, height: float) -> float:
+    """Irradiance of the ego car's lamps at a point of the global frame, ``height`` metres above the ground.
+
+    ``view_car`` is global to ego (4, 4).
+    """
     forward = view_car[0, 0] * x + view_car[0, 1] * y + view_car[0, 2] * z + view_car[0, 3] - 3.6
     side = view_car[1, 0] * x + view_car[1, 1] * y + view_car[1, 2] * z + view_car[1, 3]
     if forward < 0.3:
@@ -263,6 +266,6 @@ def headlight(light: Light, view_car: Float, x: float, y: float, z: float) -> fl
     square = forward * forward + side * side
     # Dipped beam: wide and short, brightest some way ahead, cut off above.
     beam = np.exp(-4.5 * angle * angle) * 90.0 / (square + 60.0) * min(1.0, forward / 3)
-    if z > 0.8:
-        beam *= np.exp(-(z - 0.8) * 1.6)
+    if height > 0.8:
+        beam *= np.exp(-(height - 0.8) * 1.6)
     return float(light.headlights * beam)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Float, Float32
+from predmapnet.demo_world.terrain import Terrain
 from predmapnet.demo_world.world import Solids
 
 LEAFY_SHADE = 64
@@ -33,17 +34,25 @@ def contact_polygons(solids: Solids, mask: NDArray[np.bool_]) -> list[tuple[Floa
     return [(_outline(solids, row, 0.12), 38 if solids.texture[row] == "vehicle" else 128) for row in rows]
 
 
-def shadow_polygons(solids: Solids, mask: NDArray[np.bool_], sun_direction: Float32) -> list[tuple[Float, int]]:
-    """Outlines ``(k, 2)``, metres, of the shadows of a mask's solids on the plane z = 0, and the light left, [0, 255].
+def shadow_polygons(
+    solids: Solids, mask: NDArray[np.bool_], sun_direction: Float32, terrain: Terrain | None = None
+) -> list[tuple[Float, int]]:
+    """Outlines ``(k, 2)``, metres, of the shadows of a mask's solids on the ground, and the light left, [0, 255].
 
-    ``sun_direction`` is a unit vector towards the sun, above the horizon.
+    ``sun_direction`` is a unit vector towards the sun, above the horizon. On a terrain each shadow falls on the plane
+    that touches the ground at the solid's foot.
     """
-    slope = -np.asarray(sun_direction[:2], dtype=np.float64) / max(float(sun_direction[2]), 0.05)
+    level = -np.asarray(sun_direction[:2], dtype=np.float64) / max(float(sun_direction[2]), 0.05)
     # Slices of an ellipsoid: their heights and how much narrower they are than its middle, three of them above it.
     heights = np.array([-0.8, -0.3, 0.3, 0.8])
     shrink = np.sqrt(1 - heights**2)
+    rows, rises = np.flatnonzero(mask), np.zeros(len(mask))
+    if terrain is not None:
+        rises[rows] = terrain.gradients(solids.centre[rows, :2]) @ level
     polygons = []
-    for row in np.flatnonzero(mask).tolist():
+    for row in rows.tolist():
+        # Falling ground lengthens a shadow, rising ground meets it sooner.
+        slope = level / max(1 + rises[row], 0.3)
         middle, half = solids.centre[row, 2], solids.size[row, 2] / 2
         outline, foot = _outline(solids, row), solids.centre[row, :2]
         if solids.shape[row] == "ellipsoid":
