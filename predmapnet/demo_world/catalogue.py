@@ -31,6 +31,9 @@ FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """Probability of each look of a training scene."""
 
+HILLY_SHARE = 0.0
+"""Probability that a scene's ground has slopes; raising it changes scenes, so :data:`WORLD_VERSION` goes up with it."""
+
 _TEN_LOOKS = (
     Look.DAY,
     Look.OVERCAST,
@@ -137,7 +140,21 @@ def build_world(name: str, edition: int = WORLD_VERSION) -> World:
     number = scene_number(name, edition)
     if edition == 1:
         return dress(*first_town(number), look_of(name), number, name)
-    return dress(vector_map(name), trajectory(name), look_of(name), number, name, cluttered=True)
+    world = dress(vector_map(name), trajectory(name), look_of(name), number, name, cluttered=True)
+    return hilly(world) if _is_hilly(number) else world
+
+
+def hilly(world: World) -> World:
+    """Return a flat world with ground that slopes, drawn from the world's seed."""
+    from predmapnet.demo_world.render.ground_texture import road_of
+    from predmapnet.demo_world.terrain import draw_terrain, put_on_terrain
+
+    positions = world.trajectory.ego_to_global[:, :2, 3]
+    return put_on_terrain(world, draw_terrain(world.seed, positions, road_of(world)))
+
+
+def _is_hilly(number: int) -> bool:
+    return np.random.default_rng([0x68696C6C79, number]).random() < HILLY_SHARE
 
 
 def default_cache() -> Path:

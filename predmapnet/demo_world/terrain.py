@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.world import Trajectory, World
@@ -70,9 +70,11 @@ class Terrain:
     def bend(self) -> float:
         """A bound of the second derivative of the height in any direction, per metre."""
         c = self.coefficients.astype(np.float64)
-        along = [np.abs(np.roll(c, -1, axis) - 2 * c + np.roll(c, 1, axis)).max() for axis in (0, 1)]
+        # Second derivatives are weighted means of the second differences beside them.
+        x, y = (np.abs(np.roll(c, -1, axis) - 2 * c + np.roll(c, 1, axis)) for axis in (1, 0))
         slope = np.roll(c, -1, 0) - c
-        return float((max(along) + np.abs(np.roll(slope, -1, 1) - slope).max()) / self.cell**2)
+        x, y, xy = (maximum_filter(a, 3, mode="wrap") for a in (x, y, np.abs(np.roll(slope, -1, 1) - slope)))
+        return float((np.maximum(x, y) + xy).max() / self.cell**2)
 
     @cached_property
     def top(self) -> float:
@@ -83,7 +85,7 @@ class Terrain:
         place = np.floor(points / self.cell)
         share = points / self.cell - place
         cell = place.astype(np.int64)
-        (x, y), mask = (_weights(share[..., axis], order) for axis, order in ((0, order_x), (1, order_y))), 0
+        x, y = _weights(share[..., 0], order_x), _weights(share[..., 1], order_y)
         mask = len(self.coefficients) - 1
         total = np.zeros(points.shape[:-1])
         for i in range(3):
@@ -141,12 +143,14 @@ def _crown(road: shapely.Geometry, middle: Float) -> Float:
     corner = np.floor(middle / CELL) * CELL - side / 2
     picture = np.zeros((side, side), dtype=np.uint8)
     for polygon in shapely.get_parts(road):
-        rings = [np.round(shapely.get_coordinates(ring) - corner - 0.5) for ring in (polygon.exterior, *polygon.interiors)]
+        rings = [
+            np.round(shapely.get_coordinates(ring) - corner - 0.5) for ring in (polygon.exterior, *polygon.interiors)
+        ]
         cv2.fillPoly(picture, [ring.astype(np.int32) for ring in rings], 1)
     distance = np.minimum(cv2.distanceTransform(picture, cv2.DIST_L2, 3), _CROWN_REACH).astype(np.float64)
     # Further than half the period from the drive the ground repeats itself: no crown may end there like a step.
     distance[[0, -1]] = distance[:, [0, -1]] = 0.0
-    distance = gaussian_filter(distance, 2.5, mode="wrap")
+    distance = gaussian_filter(distance, 3.5, mode="wrap")
     cells = distance.reshape(CELLS, int(CELL), CELLS, int(CELL)).mean(axis=(1, 3))
     shift = np.round(corner / CELL).astype(int)
     return np.roll(cells, (shift[1], shift[0]), axis=(0, 1))

@@ -18,6 +18,7 @@ from predmapnet.demo_world.render.relief import (
     first_guess,
     footing,
     height_over_foot,
+    least_depth,
     mirrored,
     stand_of,
 )
@@ -287,7 +288,7 @@ def shade_image(
                 ray = pixel_ray(view, x, y)
                 here = np.inf
                 if number < 0:
-                    foot = footing(relief, view, stand, ray, foot)
+                    foot = footing(relief, view, stand, ray, foot, least_depth(relief, solids.ground, row, column))
                     here = foot.depth
                     if here < np.inf:
                         colour = _ground_colour(around, relief, view, ray, foot, dynamic[row, column] / 255.0, most)
@@ -319,7 +320,7 @@ def shade_image(
 
 @kernel
 def mirror_in_wet(
-    around: Surroundings, relief: Relief | None, view: View, ground_share: Float32, image: Float32
+    around: Surroundings, relief: Relief | None, view: View, ground: Float32, ground_share: Float32, image: Float32
 ) -> None:
     """Add to wet ground what it mirrors, smeared vertically as rough water does; see :func:`shade_image`."""
     light, rotation = around.light, view.rotation
@@ -330,7 +331,7 @@ def mirror_in_wet(
             if ground_share[row, column] < 0.01:
                 continue
             ray = pixel_ray(view, column + 0.5, row + 0.5)
-            foot = footing(relief, view, stand, ray, foot)
+            foot = footing(relief, view, stand, ray, foot, least_depth(relief, ground, row, column))
             depth = foot.depth
             if depth == np.inf:
                 continue

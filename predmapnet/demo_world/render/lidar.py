@@ -25,9 +25,7 @@ _SIDE = 640
 """Pixels of each of the four square images in which rays look up what they meet (about 0.16 degrees)."""
 
 
-def _hit_distance(
-    mesh: Mesh, relief: Relief | None, ids: NDArray[np.int32], origin: Float, rays: Float
-) -> Float:
+def _hit_distance(mesh: Mesh, relief: Relief | None, ids: NDArray[np.int32], origin: Float, rays: Float) -> Float:
     """Exact distance from ``origin`` along unit ``rays`` (n, 3) to the face or ellipsoid of each id; -1 is ground."""
     distance = np.full(len(rays), np.inf)
     if relief is None:

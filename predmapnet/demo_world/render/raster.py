@@ -27,11 +27,13 @@ class ZBuffer(NamedTuple):
         nearness: ``(samples * height, samples * width) float32``, ``1 / depth``; 0 where there is no solid.
         ids: the same shape, ``int32``: face, or number of faces plus ellipsoid; -1 where there is no solid.
         planes: ``(f, 3) float64``, the :func:`face_plane` of each face that was drawn; others are not filled in.
+        ground: ``float32``, soundings of ground with slopes (:func:`.relief.sound_ground`); ``(0, 0)`` if it is flat.
     """
 
     nearness: Float32
     ids: Integer32
     planes: Float
+    ground: Float32
 
 
 class View(NamedTuple):

@@ -18,6 +18,8 @@ from predmapnet.demo_world.terrain import Terrain
 
 SIGHT = 2000.0
 """Metres, seen from above, beyond which a ray that has met no ground sees the sky."""
+BLOCK = 4
+"""Pixels between the rays that sound the depth of the ground before all others."""
 _STRIDES = 200
 _SUNK = 0.01
 """Metres that things may stand in the ground without being cut: wheels touch a plane, the ground is none."""
@@ -80,16 +82,20 @@ def stand_of(relief: Relief | None, start: Float) -> Vector:
 
 
 @part
-def meet_ground(relief: Relief, start: Float, stand: Vector, ray: Vector, most: float) -> Vector:
+def meet_ground(relief: Relief, start: Float, stand: Vector, ray: Vector, least: float, most: float) -> Vector:
     """How many times ``ray`` from ``start`` leads to the ground first, and the ground's slopes there.
 
-    ``stand`` is the :func:`stand_of` the start, which lies above the ground; infinite where the way is beyond ``most``.
+    ``stand`` is the :func:`stand_of` the start, which lies above the ground. It is known that the ground is not met
+    before ``least``; the way is infinite where it is beyond ``most``.
     """
     level = ray[0] * ray[0] + ray[1] * ray[1]
     bend = relief.bend * level
     most = min(most, SIGHT / np.sqrt(level + 1e-12))
     above, east, north = stand
     travelled = 0.0
+    if least > 0:
+        height, east, north = ground_height(relief, start[0] + least * ray[0], start[1] + least * ray[1])
+        above, travelled = start[2] + least * ray[2] - height, least
     for _ in range(_STRIDES):
         climb = ray[2] - east * ray[0] - north * ray[1]
         if above <= 1e-6:
@@ -136,8 +142,11 @@ def first_guess(view: View, stand: Vector) -> Footing:
 
 
 @part
-def footing(relief: Relief | None, view: View, stand: Vector, ray: Vector, near: Footing) -> Footing:
-    """Return where the ray of a pixel first meets the ground; ``near`` is that of a pixel beside it."""
+def footing(relief: Relief | None, view: View, stand: Vector, ray: Vector, near: Footing, least: float) -> Footing:
+    """Return where the ray of a pixel first meets the ground.
+
+    ``near`` is that of a pixel beside it, and the ground is known not to be met before the depth ``least``.
+    """
     if relief is None:
         return Footing(-view.position[2] / ray[2] if ray[2] < -1e-5 else np.inf, 0.0, 0.0, 0.0)
     position = view.position
@@ -152,7 +161,9 @@ def footing(relief: Relief | None, view: View, stand: Vector, ray: Vector, near:
         above, climb = position[2] + depth * ray[2] - height, ray[2] - east * ray[0] - north * ray[1]
         if climb < 0 and _newton_is_near(relief.bend * level, above, climb, depth):
             return Footing(depth - above / climb, east, north, height - east * x - north * y)
-    depth, east, north = meet_ground(relief, position, stand, ray, np.inf)
+    if least == np.inf:
+        return Footing(least, near.east, near.north, near.base)
+    depth, east, north = meet_ground(relief, position, stand, ray, least, np.inf)
     if depth == np.inf:
         return Footing(depth, near.east, near.north, near.base)
     x, y = position[0] + depth * ray[0], position[1] + depth * ray[1]
@@ -192,63 +203,87 @@ def height_over_foot(relief: Relief | None, owner: int, z: float) -> float:
     """Height of a place on a solid above the ground at the solid's middle."""
     if relief is None:
         return z
-    return z - relief.feet[owner]
+    return float(z - relief.feet[owner])
 
 
 @part
-def _seen(
-    relief: Relief, view: View, stand: Vector, slack: float, ray: Vector, depth: float
-) -> int:
-    """1 if nothing hides the point at ``depth`` along a ray for sure, -1 if it lies in the ground, 0 if unknown.
-
-    ``slack`` is how much lower, per metre of depth, a point of the same pixel may lie.
-    """
+def _hidden(relief: Relief, view: View, stand: Vector, ray: Vector, depth: float, least: float) -> bool:
+    """Whether the ground hides the point at ``depth`` along a ray; it is not met before the depth ``least``."""
     level = ray[0] * ray[0] + ray[1] * ray[1]
     sag = 0.5 * relief.bend * level * depth * depth
-    eye, east, north = stand
-    if eye + depth * (ray[2] - east * ray[0] - north * ray[1] - slack) > sag:
-        return 1
     x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
     above = view.position[2] + depth * ray[2] - ground_height(relief, x, y)[0]
     if above < -_SUNK:
-        return -1
+        return True
     # A height that sags by ``s * (l - s) * bend / 2`` between two ends stays positive under this condition.
-    above -= slack * depth
-    return 1 if above > 0 and np.sqrt(eye) + np.sqrt(above) > np.sqrt(sag) else 0
+    if np.sqrt(stand[0]) + np.sqrt(max(above, 0.0)) > np.sqrt(sag):
+        return False
+    # What touches the ground is met there, too: only ground well before it hides it.
+    most = 0.99 * depth - 0.02
+    return least < most and meet_ground(relief, view.position, stand, ray, least, most)[0] < most
 
 
 @kernel
-def hide_behind_ground(relief: Relief, view: View, samples: int, nearness: Float32, ids: Integer32) -> None:
-    """Take out of a z-buffer what lies in the ground or behind it; see :func:`.raster.draw_faces`."""
+def sound_ground(relief: Relief, view: View, ground: Float32) -> None:
+    """Note depths of the ground at the corners of blocks of :data:`BLOCK` by :data:`BLOCK` pixels.
+
+    ``ground (rows + 1, columns + 1)`` receives 0.97 of it: no ground above a corner is nearer than that.
+    """
     stand = stand_of(relief, view.position)
-    for row in range(view.height):
-        for column in range(view.width):
-            first = ids[row * samples, column * samples]
-            same = True
-            for i in range(samples):
-                for j in range(samples):
-                    same &= ids[row * samples + i, column * samples + j] == first
-            if same and first < 0:
+    foot = first_guess(view, stand)
+    for row in range(ground.shape[0] - 1, -1, -1):
+        for column in range(ground.shape[1]):
+            least = 0.0
+            if row + 1 < ground.shape[0]:
+                least = float(min(ground[row + 1, max(column - 1, 0)], ground[row + 1, column]))
+                least = min(least, float(ground[row + 1, min(column + 1, ground.shape[1] - 1)]))
+            foot = footing(relief, view, stand, pixel_ray(view, BLOCK * column, BLOCK * row), foot, least)
+            ground[row, column] = 0.97 * foot.depth
+
+
+@part
+def least_depth(relief: Relief | None, ground: Float32, row: int, column: int) -> float:
+    """A depth before which the ray of a pixel does not meet the ground; see :func:`sound_ground`."""
+    if relief is None:
+        return 0.0
+    row, column = row // BLOCK + 1, column // BLOCK
+    return float(min(ground[row, column], ground[row, column + 1]))
+
+
+@kernel
+def hide_behind_ground(
+    relief: Relief, view: View, samples: int, ground: Float32, nearness: Float32, ids: Integer32
+) -> None:
+    """Take out of a z-buffer what lies in the ground or behind it.
+
+    See :func:`sound_ground` and :func:`.raster.draw_faces`.
+    """
+    stand = stand_of(relief, view.position)
+    rows, columns = nearness.shape
+    side = BLOCK * samples
+    for block_row in range(ground.shape[0] - 1):
+        for block in range(ground.shape[1] - 1):
+            least = float(min(ground[block_row + 1, block], ground[block_row + 1, block + 1]))
+            if least == np.inf:
                 continue
-            if same:
-                depth = 1.0 / nearness[row * samples, column * samples]
-                ray = pixel_ray(view, column + 0.5, row + 0.5)
-                if _seen(relief, view, stand, 1.0 / view.focal_y, ray, depth) == 1:
-                    continue
-            for i in range(samples):
-                for j in range(samples):
-                    if ids[row * samples + i, column * samples + j] < 0:
+            far = np.float32(1.0 / least)
+            bottom, right = min(rows, (block_row + 1) * side), min(columns, (block + 1) * side)
+            doubtful = 0
+            for row in range(block_row * side, bottom):
+                for column in range(block * side, right):
+                    near = nearness[row, column]
+                    doubtful += int(near > 0) & int(near < far)
+            if doubtful == 0:
+                continue
+            for row in range(block_row * side, bottom):
+                for column in range(block * side, right):
+                    near = nearness[row, column]
+                    if near >= far or near <= 0:
                         continue
-                    depth = 1.0 / nearness[row * samples + i, column * samples + j]
-                    ray = pixel_ray(view, column + (j + 0.5) / samples, row + (i + 0.5) / samples)
-                    seen = _seen(relief, view, stand, 0.0, ray, depth)
-                    if seen == 0:
-                        # What touches the ground is met there, too: only ground well before it hides it.
-                        most = 0.99 * depth - 0.02
-                        seen = -1 if meet_ground(relief, view.position, stand, ray, most)[0] < most else 1
-                    if seen < 0:
-                        nearness[row * samples + i, column * samples + j] = 0.0
-                        ids[row * samples + i, column * samples + j] = -1
+                    ray = pixel_ray(view, (column + 0.5) / samples, (row + 0.5) / samples)
+                    if _hidden(relief, view, stand, ray, 1.0 / near, least):
+                        nearness[row, column] = 0.0
+                        ids[row, column] = -1
 
 
 @kernel
@@ -257,4 +292,4 @@ def meet_along(relief: Relief, start: Float, rays: Float, distance: Float) -> No
     stand = stand_of(relief, start)
     for index in range(len(rays)):
         ray = (rays[index, 0], rays[index, 1], rays[index, 2])
-        distance[index] = min(distance[index], meet_ground(relief, start, stand, ray, distance[index])[0])
+        distance[index] = min(distance[index], meet_ground(relief, start, stand, ray, 0.0, distance[index])[0])

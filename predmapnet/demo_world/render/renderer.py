@@ -17,7 +17,7 @@ from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mi
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, ZBuffer, draw_balls, draw_faces, draw_mask
-from predmapnet.demo_world.render.relief import Relief, hide_behind_ground, relief_of
+from predmapnet.demo_world.render.relief import BLOCK, Relief, hide_behind_ground, relief_of, sound_ground
 from predmapnet.demo_world.render.response import Response
 from predmapnet.demo_world.render.shading import facade_styles
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
@@ -155,7 +155,9 @@ class Renderer:
         chosen[moving] = True
         layers: list[tuple[list[Float], int]] = []
         if self.light.sun.any():
-            layers.append(([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction, terrain)], 90))
+            layers.append(
+                ([polygon for polygon, _ in shadow_polygons(placed, chosen, self.light.sun_direction, terrain)], 90)
+            )
         layers.append(([polygon for polygon, _ in contact_polygons(placed, chosen)], 30))
         darkness = []
         for polygons, value in layers:
@@ -198,9 +200,12 @@ class Renderer:
         leafy = (mesh.ball_materials == Material.FOLIAGE).astype(np.int64)
         order = np.argsort(((mesh.balls[:, :3] - view.position) ** 2).sum(axis=1))
         draw_balls(mesh.balls, leafy, order, len(mesh.counts), view, samples, self._leaves, nearness, ids)
+        ground = np.empty((0, 0), dtype=np.float32)
         if self.relief is not None:
-            hide_behind_ground(self.relief, view, samples, nearness, ids)
-        return ZBuffer(nearness, ids, planes)
+            ground = np.empty((-(-view.height // BLOCK) + 1, -(-view.width // BLOCK) + 1), dtype=np.float32)
+            sound_ground(self.relief, view, ground)
+            hide_behind_ground(self.relief, view, samples, ground, nearness, ids)
+        return ZBuffer(nearness, ids, planes, ground)
 
     def render(self, camera: Camera, frame_index: int) -> RenderedImage:
         """Draw what a camera sees at a key frame; the same bytes for the same world, camera and frame.
@@ -227,7 +232,7 @@ class Renderer:
             around, moment.relief, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth, ground_share
         )
         if self.light.wetness > 0:
-            mirror_in_wet(around, moment.relief, view, ground_share, image)
+            mirror_in_wet(around, moment.relief, view, solids.ground, ground_share, image)
         return RenderedImage(self._develop(image, camera, frame_index), depth)
 
     def _develop(self, image: NDArray[np.float32], camera: Camera, frame_index: int) -> NDArray[np.uint8]:
