@@ -25,6 +25,8 @@ SHARPEST = 1 / 400
 LONGEST_WAVE, SHORTEST_WAVE = 1024.0, 170.0
 CAMBER = (0.010, 0.025)
 """Range from which the fall of streets from their middle to their kerbs is drawn."""
+_ACROSS = 0.2
+"""How steep waves across the drive are, relative to those along it: roads tilt sideways less than they climb."""
 _CROWN_REACH = 5.0
 """Metres from the kerb at which the ground no longer rises."""
 
@@ -112,7 +114,7 @@ def draw_terrain(seed: int, positions: Float, road: shapely.Geometry) -> Terrain
     """
     generator = np.random.default_rng([0x68696C6C, seed])
     steepest, camber = generator.uniform(*STEEPEST), generator.uniform(*CAMBER)
-    hills = Terrain(_waves(generator))
+    hills = Terrain(_waves(generator, np.linalg.svd(positions - positions.mean(axis=0), full_matrices=False)[2][0]))
     near = shapely.get_coordinates(shapely.MultiPoint(positions).buffer(100.0).envelope)[:3]
     steps = [np.arange(near[:, axis].min(), near[:, axis].max(), CELL) for axis in range(2)]
     grades = np.linalg.norm(hills.gradients(np.stack(np.meshgrid(*steps), axis=-1)), axis=-1)
@@ -121,8 +123,8 @@ def draw_terrain(seed: int, positions: Float, road: shapely.Geometry) -> Terrain
     return Terrain((scale * hills.coefficients + crown).astype(np.float32))
 
 
-def _waves(generator: np.random.Generator) -> Float32:
-    """Coefficients of a few long waves in all directions, whose heights are such that each has about the same grade."""
+def _waves(generator: np.random.Generator, axis: Float) -> Float32:
+    """Coefficients of a few long waves, each of about the same grade; fewer across ``axis``: streets are built so."""
     period = CELL * CELLS
     most = int(period / SHORTEST_WAVE)
     numbers = np.array([(i, j) for i in range(most + 1) for j in range(-most, most + 1) if i > 0 or j > 0])
@@ -132,7 +134,8 @@ def _waves(generator: np.random.Generator) -> Float32:
     middle = (np.arange(CELLS) + 0.5) * 2 * np.pi / CELLS
     total = np.zeros((CELLS, CELLS))
     for i, j in numbers[chosen]:
-        height = generator.normal() / np.hypot(i, j)
+        length = np.hypot(i, j)
+        height = generator.normal() / length * (_ACROSS + (1 - _ACROSS) * ((i, j) @ axis / length) ** 2)
         total += height * np.cos(i * middle[None, :] + j * middle[:, None] + generator.uniform(0, 2 * np.pi))
     return total.astype(np.float32)
 
@@ -143,9 +146,8 @@ def _crown(road: shapely.Geometry, middle: Float) -> Float:
     corner = np.floor(middle / CELL) * CELL - side / 2
     picture = np.zeros((side, side), dtype=np.uint8)
     for polygon in shapely.get_parts(road):
-        rings = [
-            np.round(shapely.get_coordinates(ring) - corner - 0.5) for ring in (polygon.exterior, *polygon.interiors)
-        ]
+        outlines = (polygon.exterior, *polygon.interiors)
+        rings = [np.round(shapely.get_coordinates(ring) - corner - 0.5) for ring in outlines]
         cv2.fillPoly(picture, [ring.astype(np.int32) for ring in rings], 1)
     distance = np.minimum(cv2.distanceTransform(picture, cv2.DIST_L2, 3), _CROWN_REACH).astype(np.float64)
     # Further than half the period from the drive the ground repeats itself: no crown may end there like a step.

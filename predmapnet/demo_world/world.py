@@ -2,8 +2,8 @@
 
 A :class:`VectorMap` and a :class:`Trajectory` come from a town generator or from a real data set;
 :func:`predmapnet.demo_world.street.dressing.dress` turns them into a :class:`World`, which the renderer draws.
-Coordinates are metres in the global frame. The map lies in the plane z = 0, and so does the road surface unless the world
-has a terrain, which raises all that is at (x, y) by the height of the ground there.
+Coordinates are metres in the global frame. The map lies in the plane z = 0, and so does the road surface unless the
+world has a terrain, which raises all that is at (x, y) by the height of the ground there.
 """
 
 from __future__ import annotations

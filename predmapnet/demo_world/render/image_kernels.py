@@ -22,7 +22,7 @@ from predmapnet.demo_world.render.relief import (
     mirrored,
     stand_of,
 )
-from predmapnet.demo_world.render.shading import Colour, facade, headlight, read_ground, sky, smooth_noise
+from predmapnet.demo_world.render.shading import Colour, facade, headlight, lamp_light, read_ground, sky, smooth_noise
 from predmapnet.demo_world.street.looks import Light
 
 
@@ -54,18 +54,6 @@ class Surroundings(NamedTuple):
 
 
 @part
-def _lamp_light(around: Surroundings, x: float, y: float) -> float:
-    column, row = int(np.floor(x - around.lamps_origin[0])), int(np.floor(y - around.lamps_origin[1]))
-    rows, columns = around.lamps.shape
-    if row < 0 or column < 0 or row >= rows - 1 or column >= columns - 1:
-        return 0.0
-    u, v = x - around.lamps_origin[0] - column, y - around.lamps_origin[1] - row
-    top = around.lamps[row, column] * (1 - u) + around.lamps[row, column + 1] * u
-    low = around.lamps[row + 1, column] * (1 - u) + around.lamps[row + 1, column + 1] * u
-    return float(top * (1 - v) + low * v)
-
-
-@part
 def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
     clear = np.exp(-light.haze * distance)
     return (
@@ -86,7 +74,7 @@ def _lit(
     light = around.light
     lamps = 0.0
     if light.lamps > 0:
-        lamps = light.lamps * _lamp_light(around, x, y)
+        lamps = light.lamps * lamp_light(around.lamps, around.lamps_origin, x, y)
     beam = 0.0
     if light.headlights > 0:
         beam = headlight(light, around.global_to_ego, x, y, z, height) * facing

@@ -288,7 +288,7 @@ def hide_behind_ground(
 
 @kernel
 def meet_along(relief: Relief, start: Float, rays: Float, distance: Float) -> None:
-    """Shorten the ``distance (n,)`` along ``rays (n, 3)`` from ``start (3,)`` to where each meets the ground before."""
+    """Shorten ``distance (n,)``, lengths of ``rays (n, 3)`` from ``start (3,)``, to where each meets the ground."""
     stand = stand_of(relief, start)
     for index in range(len(rays)):
         ray = (rays[index, 0], rays[index, 1], rays[index, 2])

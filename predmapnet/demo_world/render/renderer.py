@@ -17,7 +17,7 @@ from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mi
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, ZBuffer, draw_balls, draw_faces, draw_mask
-from predmapnet.demo_world.render.relief import BLOCK, Relief, hide_behind_ground, relief_of, sound_ground
+from predmapnet.demo_world.render.relief import BLOCK, Relief, hide_behind_ground, meet_along, relief_of, sound_ground
 from predmapnet.demo_world.render.response import Response
 from predmapnet.demo_world.render.shading import facade_styles
 from predmapnet.demo_world.render.shadows import contact_polygons, shadow_polygons
@@ -67,6 +67,14 @@ def _lamp_field(world: World) -> tuple[NDArray[np.float32], tuple[float, float]]
             # Lambert's cosine and the inverse square of the distance, normalised below the lamp.
             window += (0.55 * (lamp[2] ** 2 / (square + lamp[2] ** 2)) ** 2).astype(np.float32)
     return field, (float(low[0]), float(low[1]))
+
+
+def _in_sight(relief: Relief, view: View, corners: Float, counts: NDArray[np.int64]) -> tuple[Float, NDArray[np.int64]]:
+    """Leave out outlines on the ground, ``(k, 8, 3)`` of ``counts (k,)`` corners, whose middle lies behind a crest."""
+    rays = corners.sum(axis=1) / counts[:, None] + [0.0, 0.0, 0.3] - view.position
+    met = np.ones(len(counts))
+    meet_along(relief, view.position, rays, met)
+    return corners[met > 0.98], counts[met > 0.98]
 
 
 class Renderer:
@@ -180,6 +188,8 @@ class Renderer:
         """Ground darkened by what moves, ``(height, width)``, 255 where nothing does."""
         mask = np.full((view.height, view.width), 255, dtype=np.uint8)
         for corners, counts, value in moment.darkness:
+            if moment.relief is not None and len(counts):
+                corners, counts = _in_sight(moment.relief, view, corners, counts)
             draw_mask(corners, counts, view, value, np.empty((18, 3)), mask)
         moves = any(len(counts) for _, counts, _ in moment.darkness)
         return np.asarray(cv2.blur(mask, (3, 3)), dtype=np.uint8) if moves else mask

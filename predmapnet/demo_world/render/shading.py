@@ -269,3 +269,16 @@ def headlight(light: Light, view_car: Float, x: float, y: float, z: float, heigh
     if height > 0.8:
         beam *= np.exp(-(height - 0.8) * 1.6)
     return float(light.headlights * beam)
+
+
+@part
+def lamp_light(lamps: Float32, origin: tuple[float, float], x: float, y: float) -> float:
+    """Light of street lamps on the ground, read between the cells ``(rows, columns)`` of a metre each."""
+    column, row = int(np.floor(x - origin[0])), int(np.floor(y - origin[1]))
+    rows, columns = lamps.shape
+    if row < 0 or column < 0 or row >= rows - 1 or column >= columns - 1:
+        return 0.0
+    u, v = x - origin[0] - column, y - origin[1] - row
+    top = lamps[row, column] * (1 - u) + lamps[row, column + 1] * u
+    low = lamps[row + 1, column] * (1 - u) + lamps[row + 1, column + 1] * u
+    return float(top * (1 - v) + low * v)

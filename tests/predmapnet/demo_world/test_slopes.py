@@ -13,7 +13,7 @@ from shapely import box
 
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.nuscenes import NuScenesSource
-from predmapnet.demo_world.catalogue import WORLD_VERSION, hilly
+from predmapnet.demo_world.catalogue import WORLD_VERSION
 from predmapnet.demo_world.nuscenes.writer import write_scene
 from predmapnet.demo_world.render.lidar import scan
 from predmapnet.demo_world.render.mesh import build_mesh
@@ -22,7 +22,7 @@ from predmapnet.demo_world.render.renderer import Renderer
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.street.solid_list import SolidList
-from predmapnet.demo_world.terrain import CELL, CELLS, SHARPEST, TRACK, WHEELBASE, Terrain, on_terrain, put_on_terrain
+from predmapnet.demo_world.terrain import CELL, CELLS, TRACK, WHEELBASE, Terrain, on_terrain, put_on_terrain
 from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
 
 DATA = Path(__file__).parents[2] / "data"
@@ -112,37 +112,40 @@ def test_depth_on_a_plane_that_rises_by_six_percent_is_that_of_the_closed_form(c
     assert (depth[falls < 0] * np.linalg.norm(rays[falls < 0][..., :2], axis=-1) > 170.0).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
-    seed=st.integers(0, 40),
+    seed=st.integers(0, 1000),
     radius=st.floats(60.0, 2000.0),
     place=st.tuples(st.floats(0, PERIOD), st.floats(0, PERIOD)),
     eye=st.floats(0.3, 3.0),
-    azimuth=st.floats(0, 2 * np.pi),
-    dip=st.floats(-0.2, 0.08),
 )
-def test_a_ray_meets_the_ground_where_small_steps_first_find_it(seed, radius, place, eye, azimuth, dip):
-    terrain = waves(seed, radius)
+def test_a_ray_meets_the_ground_where_small_steps_first_find_it(seed, radius, place, eye):
+    terrain, random, count = waves(seed, radius), np.random.default_rng(seed), 40
     start = np.array([*place, terrain.heights(np.array(place)) + eye])
-    ray = np.array([np.cos(azimuth), np.sin(azimuth), dip])
-    distance = np.array([400.0])
-    meet_along(relief_of(terrain, np.zeros((0, 3))), start, ray[None], distance)
-    steps = np.arange(0.0, 400.0, 0.02)
-    points = start + steps[:, None] * ray
-    above = points[:, 2] - terrain.heights(points[:, :2])
-    (found,) = np.nonzero(above <= 0)
-    expected = steps[found[0]] if len(found) else 400.0
-    if abs(distance[0] - expected) > 0.05:
-        # A ray that touches a crest may pass it or not.
-        earlier = min(distance[0], expected)
-        assert np.abs(above[np.abs(steps - earlier) < 0.5]).min() < 2e-4 * max(earlier, 1.0)
+    # Most rays aim at places a little above or below the ground: they graze crests on their way.
+    azimuth, away = random.uniform(0, 2 * np.pi, count), random.uniform(5, 250, count)
+    aims = start[:2] + away[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    dip = (terrain.heights(aims) + random.normal(0, 0.3, count) - start[2]) / away
+    rays = np.column_stack([np.cos(azimuth), np.sin(azimuth), dip])
+    met = np.full(count, 300.0)
+    meet_along(relief_of(terrain, np.zeros((0, 3))), start, rays, met)
+    steps = np.arange(0.0, 300.0, 0.05)
+    points = start + steps[:, None, None] * rays
+    above = points[..., 2] - terrain.heights(points[..., :2])
+    for ray in range(count):
+        (found,) = np.nonzero(above[:, ray] <= 0)
+        expected = steps[found[0]] if len(found) else 300.0
+        if abs(met[ray] - expected) > 0.1:
+            # A ray that touches a crest may pass it or not.
+            earlier = min(met[ray], expected)
+            assert np.abs(above[np.abs(steps - earlier) < 0.5, ray]).min() < 1e-4 * max(earlier, 10.0)
 
 
 def test_a_crest_hides_what_lies_low_behind_it_and_not_what_is_high():
     # The crest is 40 m ahead, 2.5 m above the car and the boxes.
     crest = Terrain((2.5 * np.exp(-0.5 * ((X - PLACE[0] - 40.0) / 14.0) ** 2)).astype(np.float32))
     solids = SolidList()
-    low, high = PLACE + [80.0, 6.0], PLACE + [80.0, -6.0]
+    low, high = PLACE + np.array([[80.0, 6.0], [80.0, -6.0]])
     solids.stand("box", low, (4.0, 4.0, 1.2), 0.0, (0.9, 0.0, 0.0))
     solids.stand("box", high, (4.0, 4.0, 12.0), 0.0, (0.9, 0.0, 0.0))
     seen = []
@@ -171,7 +174,9 @@ def test_cars_stand_with_their_wheels_on_the_ground():
     flat = poses_at(random.uniform(0, 1000, (200, 2)), headings)
     placed = on_terrain(Trajectory(np.arange(200), flat), terrain).ego_to_global
     np.testing.assert_array_equal(placed[:, :2, 3], flat[:, :2, 3])
-    np.testing.assert_allclose(placed[:, :3, :3] @ placed[:, :3, :3].transpose(0, 2, 1), flat[:, :3, :3] * 0 + np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        placed[:, :3, :3] @ placed[:, :3, :3].transpose(0, 2, 1), flat[:, :3, :3] * 0 + np.eye(3), atol=1e-12
+    )
     np.testing.assert_allclose(np.exp(1j * np.arctan2(placed[:, 1, 0], placed[:, 0, 0])), np.exp(1j * headings))
     for along in (0.0, WHEELBASE):
         for side in (TRACK / 2, -TRACK / 2):
@@ -185,7 +190,9 @@ def test_pitch_and_roll_of_a_flat_drive_come_on_top_of_the_grounds():
     nod = np.array([[np.cos(0.02), 0, np.sin(0.02)], [0, 1, 0], [-np.sin(0.02), 0, np.cos(0.02)]])
     nodding = flat.copy()
     nodding[:, :3, :3] = flat[:, :3, :3] @ nod
-    still, nodded = (on_terrain(Trajectory(np.zeros(1), poses), plane()).ego_to_global[0, :3, :3] for poses in (flat, nodding))
+    still, nodded = (
+        on_terrain(Trajectory(np.zeros(1), poses), plane()).ego_to_global[0, :3, :3] for poses in (flat, nodding)
+    )
     np.testing.assert_allclose(still.T @ nodded, nod, atol=1e-12)
 
 
@@ -225,7 +232,7 @@ def test_ground_pixels_of_a_street_on_waves_lie_on_the_ground(dressed):
 
 
 def test_flat_worlds_come_out_as_before_there_were_slopes(street):
-    """The picture was drawn by the renderer that knew flat ground only; processors of another kind may round otherwise."""
+    """The picture is of the renderer that knew flat ground only; processors of another kind may round otherwise."""
     camera = replace(FRONT, width=160, height=90, intrinsics=np.diag([0.2, 0.2, 1]) @ FRONT.intrinsics)
     drawn = []
     for look in (Look.DAY, Look.WET, Look.NIGHT):
@@ -250,7 +257,9 @@ def test_the_zero_height_field_looks_like_flat_ground(street):
 
 def test_lidar_points_lie_on_the_ground_and_so_do_those_of_a_written_scene(dressed, tmp_path):
     world = bare_world(waves(7, 300.0))
-    world = replace(world, trajectory=on_terrain(Trajectory(np.zeros(1, np.int64), poses_at(PLACE[None], [0.7])), world.terrain))
+    world = replace(
+        world, trajectory=on_terrain(Trajectory(np.zeros(1, np.int64), poses_at(PLACE[None], [0.7])), world.terrain)
+    )
     points = scan(Renderer(world, texel=0.3), 0)[:, :3]
     pose = world.trajectory.ego_to_global[0] @ LIDAR_TO_EGO
     there = points @ pose[:3, :3].T + pose[:3, 3]
