@@ -19,10 +19,22 @@ from predmapnet.demo_world.render.lidar import scan
 from predmapnet.demo_world.render.mesh import build_mesh
 from predmapnet.demo_world.render.relief import meet_along, relief_of
 from predmapnet.demo_world.render.renderer import Renderer
+from predmapnet.demo_world.render.shadows import shadow_polygons
 from predmapnet.demo_world.rig import DEMO_RIG, LIDAR_TO_EGO
 from predmapnet.demo_world.street.dressing import dress
 from predmapnet.demo_world.street.solid_list import SolidList
-from predmapnet.demo_world.terrain import CELL, CELLS, TRACK, WHEELBASE, Terrain, on_terrain, put_on_terrain
+from predmapnet.demo_world.terrain import (
+    CAMBER,
+    CELL,
+    CELLS,
+    STEEPEST,
+    TRACK,
+    WHEELBASE,
+    Terrain,
+    draw_terrain,
+    on_terrain,
+    put_on_terrain,
+)
 from predmapnet.demo_world.world import Look, Surface, Trajectory, VectorMap, World
 
 DATA = Path(__file__).parents[2] / "data"
@@ -277,3 +289,38 @@ def test_lidar_points_lie_on_the_ground_and_so_do_those_of_a_written_scene(dress
         there = scene.lidar(index) @ pose[:3, :3].T + pose[:3, 3]
         error = there[:, 2] - dressed.terrain.heights(there[:, :2])
         assert np.mean(np.abs(error) < 0.05) > 0.3 and np.percentile(error, 1) > -0.06
+
+
+def test_drawn_hills_keep_to_the_grades_and_radii_of_streets(street):
+    vector_map, trajectory = street
+    positions = trajectory.ego_to_global[:, :2, 3]
+    steepest = []
+    for seed in range(12):
+        terrain = draw_terrain(seed, positions, vector_map.road_segments[0])
+        x, y = np.meshgrid(np.arange(-120, 60, 3.0), np.arange(-90, 90, 3.0))
+        steepest.append(np.linalg.norm(terrain.gradients(np.stack([x, y], axis=-1)), axis=-1).max())
+        along = terrain.heights(positions[0] + np.arange(-20.0, 60.0, 10.0)[:, None] * [1.0, 0.0])
+        assert np.abs(np.diff(along, 2)).max() / 100 < 1 / 380, "the middle of a street has no camber along it"
+        assert 1 / terrain.bend > 120
+    assert max(steepest) < STEEPEST[1] + CAMBER[1] + 0.01
+    assert min(steepest) > 0.01 and np.ptp(steepest) > 0.01
+    # Streets fall to their kerbs on both sides by what is asked, as far as a smooth surface can.
+    kerb, middle = np.array([[50.0, -6.0], [50.0, 6.0]]), np.array([[50.0, 0.0]])
+    fall = [
+        (terrain.heights(middle) - terrain.heights(kerb).mean())[0] / 6.0
+        for terrain in (draw_terrain(seed, positions, vector_map.road_segments[0]) for seed in range(12))
+    ]
+    assert 0.003 < np.median(fall) < CAMBER[1]
+
+
+def test_the_shadow_of_a_pole_ends_where_the_sunbeam_past_its_top_meets_the_slope():
+    solids = SolidList()
+    solids.stand("cylinder", PLACE, (0.02, 0.02, 6.0), 0.0, (0.2, 0.2, 0.2))
+    sun = np.array([-0.6, 0.5, 0.4])
+    sun /= np.linalg.norm(sun)
+    ((outline, _),) = shadow_polygons(solids.solids(), np.array([True]), sun.astype(np.float32), plane())
+    beam = np.array([6.0]) * 10
+    meet_along(relief_of(plane(), np.zeros((0, 3))), np.array([*PLACE, plane().heights(PLACE) + 6.0]), -sun[None], beam)
+    end = PLACE - beam[0] * sun[:2]
+    assert np.linalg.norm(outline - end, axis=1).min() < 0.05
+    assert np.linalg.norm(outline - PLACE, axis=1).max() == pytest.approx(np.linalg.norm(end - PLACE), abs=0.05)
