@@ -19,7 +19,7 @@ from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
-WORLD_VERSION = 3
+WORLD_VERSION = 4
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
 
 SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "test": range(101, 111)}
@@ -31,7 +31,7 @@ FIRST_SPLITS: dict[str, range] = {"test": range(101, 111)}
 LOOK_SHARES = {Look.DAY: 0.45, Look.DUSK: 0.12, Look.OVERCAST: 0.20, Look.WET: 0.13, Look.NIGHT: 0.10}
 """Probability of each look of a training scene."""
 
-HILLY_SHARE = 0.0
+HILLY_SHARE = 0.6
 """Probability that a scene's ground has slopes; raising it changes scenes, so :data:`WORLD_VERSION` goes up with it."""
 
 _TEN_LOOKS = (

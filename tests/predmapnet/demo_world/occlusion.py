@@ -34,7 +34,9 @@ def hidden_share(renderer: Renderer, rig: Rig, frame_index: int, roi: RegionOfIn
     """
     ego_to_global = renderer.world.trajectory.ego_to_global[frame_index]
     points = painted_points(renderer)
-    points = np.column_stack([points, np.zeros(len(points)), np.ones(len(points))])
+    terrain = renderer.world.terrain
+    height = np.zeros(len(points)) if terrain is None else terrain.heights(points)
+    points = np.column_stack([points, height, np.ones(len(points))])
     ego = points @ inverse_pose(ego_to_global).T
     inside = (np.abs(ego[:, 0]) <= roi.length / 2) & (np.abs(ego[:, 1]) <= roi.width / 2)
     ego = ego[inside]
