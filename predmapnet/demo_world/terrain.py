@@ -26,7 +26,7 @@ LONGEST_WAVE, SHORTEST_WAVE = 1024.0, 170.0
 CAMBER = (0.010, 0.025)
 """Range from which the fall of streets from their middle to their kerbs is drawn."""
 _ACROSS = 0.2
-"""How steep waves across the drive are, relative to those along it: roads tilt sideways less than they climb."""
+"""Steepness of waves across the drive, relative to those along it: roads tilt sideways less than they climb."""
 _CROWN_REACH = 5.0
 """Metres from the kerb at which the ground no longer rises."""
 

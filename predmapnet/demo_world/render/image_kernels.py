@@ -19,7 +19,7 @@ from predmapnet.demo_world.render.relief import (
     footing,
     height_over_foot,
     least_depth,
-    mirrored,
+    mirrored_ray,
     stand_of,
 )
 from predmapnet.demo_world.render.shading import Colour, facade, headlight, lamp_light, read_ground, sky, smooth_noise
@@ -333,7 +333,7 @@ def mirror_in_wet(
             red = green = blue = 0.0
             for step in range(4):
                 # The ripple tilts the mirrored ray up and down.
-                mx, my, mz = mirrored(relief, ray, along, foot, 0.55 + 0.45 * step)
+                mx, my, mz = mirrored_ray(relief, ray, along, foot, 0.55 + 0.45 * step)
                 local_x = rotation[0, 0] * mx + rotation[1, 0] * my + rotation[2, 0] * mz
                 local_y = rotation[0, 1] * mx + rotation[1, 1] * my + rotation[2, 1] * mz
                 local_z = rotation[0, 2] * mx + rotation[1, 2] * my + rotation[2, 2] * mz

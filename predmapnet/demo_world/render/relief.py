@@ -1,4 +1,4 @@
-"""Where rays meet ground with slopes, and what that ground hides.
+"""Rays that meet ground with slopes, and things that such ground hides.
 
 Along a ray, the height above the ground bends by at most ``bend`` per metre squared. From where it is now and how it
 changes there, that bounds how early it can reach zero: a stride to that place never steps over a crest, and strides
@@ -83,7 +83,7 @@ def stand_of(relief: Relief | None, start: Float) -> Vector:
 
 @part
 def meet_ground(relief: Relief, start: Float, stand: Vector, ray: Vector, least: float, most: float) -> Vector:
-    """How many times ``ray`` from ``start`` leads to the ground first, and the ground's slopes there.
+    """Return after how many times ``ray`` from ``start`` the ground is met first, and its slopes there.
 
     ``stand`` is the :func:`stand_of` the start, which lies above the ground. It is known that the ground is not met
     before ``least``; the way is infinite where it is beyond ``most``.
@@ -119,7 +119,7 @@ def _newton_is_near(bend: float, above: float, climb: float, travelled: float) -
 
 
 class Footing(NamedTuple):
-    """Where the ray of a pixel meets the ground.
+    """The place where the ray of a pixel meets the ground.
 
     Attributes:
         depth: along the optical axis; infinite where it meets none.
@@ -172,10 +172,10 @@ def footing(relief: Relief | None, view: View, stand: Vector, ray: Vector, near:
 
 @part
 def facing_of(relief: Relief | None, view: View, ray: Vector, foot: Footing) -> tuple[float, float, float, float]:
-    """How a ray and a pixel's sides approach the ground: rates of height above its plane, and the plane's cosine.
+    """Measure how a ray and a pixel's sides approach the ground.
 
-    Returns the rate along the ray (negative), per unit to the right and down in the image plane, and the cosine of the
-    plane's tilt.
+    Returns rates of the height above its plane: along the ray (negative), per unit to the right and down in the image
+    plane; and the cosine of the plane's tilt.
     """
     rotation = view.rotation
     if relief is None:
@@ -189,7 +189,7 @@ def facing_of(relief: Relief | None, view: View, ray: Vector, foot: Footing) -> 
 
 
 @part
-def mirrored(relief: Relief | None, ray: Vector, along: float, foot: Footing, ripple: float) -> Vector:
+def mirrored_ray(relief: Relief | None, ray: Vector, along: float, foot: Footing, ripple: float) -> Vector:
     """A ray mirrored in the ground, of which it leaves ``ripple`` times as fast as it came (1 for still water)."""
     if relief is None:
         return ray[0], ray[1], -ray[2] * ripple
