@@ -87,3 +87,12 @@ def test_the_first_towns_are_still_what_they_were():
     vector_map, driven = first_town(103)
     assert len(vector_map.road_segments) == 21
     assert md5(np.round(driven.ego_to_global, 6).tobytes()).hexdigest() == "38f1369487702b6cb8eec962f6ff8e1e"
+
+
+def test_three_of_five_towns_are_hilly_and_their_cars_stand_on_the_hills():
+    hilly, flat = (catalogue.build_world(name) for name in ("scene-0103", "scene-0102"))
+    assert flat.terrain is None and not flat.trajectory.ego_to_global[:, 2, 3].any()
+    assert hilly.terrain is not None
+    poses = hilly.trajectory.ego_to_global
+    assert np.allclose(poses[:, 2, 3], hilly.terrain.heights(poses[:, :2, 3])) and np.ptp(poses[:, 2, 3]) > 0.5
+    assert 0.55 < np.mean([catalogue._is_hilly(number) for number in catalogue.SPLITS["train"]]) < 0.65
