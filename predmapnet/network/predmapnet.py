@@ -151,7 +151,8 @@ class PredMapNet(nn.Module):
         """From images to image features: no memory and no geometry yet."""
         valid = inputs.camera_valid
         # What a masked camera saw must not reach anything, not even as not-a-number.
-        images = inputs.images.masked_fill(~valid[:, :, None, None, None], 0.0).flatten(0, 1)
+        pixels = inputs.images.movedim(2, -1).masked_fill(~valid[:, :, None, None, None], 0.0)
+        images = pixels.flatten(0, 1).movedim(-1, 1)
         seen = valid.flatten().nonzero()[:, 0] if self.training else None
         if seen is not None and 0 < len(seen) < len(images):  # Black images would enter the batch statistics.
             images = images[seen]
