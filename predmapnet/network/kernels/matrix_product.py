@@ -9,7 +9,10 @@ from torch import Tensor, nn
 from predmapnet.network.kernels.tracing import is_traced
 
 MANY_ROWS = 512
-"""From here on a convolution's greater overhead pays."""
+"""Fewer rows are no work for a convolution."""
+
+MANY_PRODUCTS = 2**26
+"""Multiply-adds from which on a convolution's greater overhead pays; below, MKL is as fast or up to twice as fast."""
 
 ONEDNN = torch.backends.mkldnn.is_available()
 
@@ -20,14 +23,15 @@ SMALLEST_BATCH = 16
 def linear(tokens: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """Multiply tokens ``(..., C_in)`` by a weight ``(C_out, C_in)`` and add the bias, in the precision of the weight.
 
-    On a CPU, torch multiplies matrices by MKL, which runs at less than half the machine's rate unless Intel made it,
-    and convolutions by oneDNN, which does not. So many rows are put as the pixels of a 1x1 convolution.
+    On a CPU, torch multiplies matrices by MKL, which runs below the machine's rate unless Intel made it, and
+    convolutions by oneDNN, which does not. So large products are put as 1x1 convolutions, rows as pixels.
     """
     tokens = tokens.to(weight.dtype)
     if is_traced():
         return F.linear(tokens, weight, bias)
     rows = tokens.numel() // weight.shape[1]
-    batch = _divisor(rows) if rows >= MANY_ROWS and tokens.device.type == "cpu" else None
+    is_large = rows >= MANY_ROWS and rows * weight.numel() >= MANY_PRODUCTS
+    batch = _divisor(rows) if is_large and tokens.device.type == "cpu" else None
     if batch is None or not ONEDNN:
         return F.linear(tokens, weight, bias)
     pixels = tokens.reshape(batch, rows // batch, 1, -1).permute(0, 3, 1, 2)
