@@ -58,6 +58,24 @@ def warp_bev(maps: Tensor, current_to_past: Tensor, roi: RegionOfInterest) -> Te
     return F.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
+def cells_in_past(rows: int, columns: int, current_to_past: Tensor, roi: RegionOfInterest) -> tuple[Tensor, Tensor]:
+    """Return where the cells of the current grid lie in past frames: x and y ``(B, H, W, D)``, normalised.
+
+    Args:
+        rows, columns: of the grid.
+        current_to_past: ``(B, D, 2, 3)``, metres.
+        roi: the region that the grid covers in all frames.
+    """
+    cells = cell_centres(rows, columns, current_to_past.device) - 0.5
+    x, y = cells[0, :, 0, None] * roi.length, cells[:, 0, 1, None, None] * roi.width
+
+    def moved(row: Tensor, size: float) -> Tensor:
+        along_x, along_y, shift = (row / size)[:, None, None].unbind(-1)
+        return (x * along_x + (shift + 0.5)) + y * along_y
+
+    return moved(current_to_past[:, :, 0], roi.length), moved(current_to_past[:, :, 1], roi.width)
+
+
 def invert_pose(pose: Tensor) -> Tensor:
     """Invert rigid poses ``(..., 4, 4)`` in their own precision."""
     turned_back = pose[..., :3, :3].transpose(-1, -2)

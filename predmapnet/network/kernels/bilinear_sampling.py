@@ -25,21 +25,32 @@ def bilinear_corners(x: Tensor, y: Tensor, width: int, height: int) -> tuple[Ten
         Flat indices ``(..., 4) int32`` into the map, row by row, and weights ``(..., 4)``; pixels outside the map
         have weight zero (and the index of a pixel inside).
     """
-    columns, column_weights = _neighbours(x, width)
-    rows, row_weights = _neighbours(y, height)
-    indices = rows[..., :, None] * width + columns[..., None, :]
-    weights = row_weights[..., :, None] * column_weights[..., None, :]
-    return indices.flatten(-2), weights.flatten(-2)
+    left, right, of_left, of_right = _neighbours(x, width)
+    top, bottom, of_top, of_bottom = _neighbours(y, height)
+    top, bottom = top * width, bottom * width
+    indices = torch.stack([top + left, top + right, bottom + left, bottom + right], dim=-1)
+    weights = torch.stack([of_top * of_left, of_top * of_right, of_bottom * of_left, of_bottom * of_right], dim=-1)
+    return indices, weights
 
 
-def _neighbours(position: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Return the two neighbours ``(..., 2) int32`` of each position on a line of pixels, and their shares."""
-    first = position.floor()
-    fraction = position - first
-    both = torch.stack([first, first + 1], dim=-1)
-    clamped = both.clamp(0, size - 1)
-    shares = torch.stack([1 - fraction, fraction], dim=-1)
-    return clamped.int(), shares * (both == clamped)
+def _neighbours(position: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the two neighbours ``(...) int32`` of each position on a line of pixels, and their shares.
+
+    Whole tensors side by side: operations over pairs would begin anew with each of them.
+    """
+    whole = position.floor()
+    fraction = position - whole
+    first = whole.int()
+    second = first + 1
+    # Clamped as integers, so that a position that is not a number finds a pixel too, with a share like itself.
+    first_inside, second_inside = first.clamp(0, size - 1), second.clamp(0, size - 1)
+    shares = (1 - fraction) * (first == first_inside), fraction * (second == second_inside)
+    return first_inside, second_inside, *shares
+
+
+def samples_by_rows(features: Tensor) -> bool:
+    """Whether :func:`weighted_rows` is the faster way to sample: on a CPU, where nothing is learned or traced."""
+    return features.device.type == "cpu" and not torch.is_grad_enabled() and not is_traced()
 
 
 def weighted_rows(table: Tensor, indices: Tensor, weights: Tensor) -> Tensor:

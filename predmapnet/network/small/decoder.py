@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from mapfusion.elements import RegionOfInterest
 from predmapnet.config import PointDecoderConfig, PredMapNetConfig
+from predmapnet.network.kernels.bilinear_sampling import bilinear_corners, samples_by_rows, weighted_rows
 from predmapnet.network.layers import (
     SINE_FREQUENCIES,
     Attention,
@@ -132,9 +133,21 @@ class PointDecoder(MapDecoder):
 
 def sample_bev(bev: Tensor, positions: Tensor) -> Tensor:
     """Interpolate the BEV ``(B, D, H, W)`` at normalised ``(B, R, P, K, 2)``, outside zeros: ``(B, R, P, K, D)``."""
+    if samples_by_rows(bev):
+        return _rows_of_bev(bev, positions)
     grid = torch.stack([positions[..., 0] * 2 - 1, 1 - positions[..., 1] * 2], dim=-1)
     sampled = F.grid_sample(bev, grid.flatten(1, 2), mode="bilinear", padding_mode="zeros", align_corners=False)
     return sampled.permute(0, 2, 3, 1).unflatten(1, positions.shape[1:3])
+
+
+def _rows_of_bev(bev: Tensor, positions: Tensor) -> Tensor:
+    """Return the same by :func:`weighted_rows`, on a CPU three times as fast where channels are last in memory."""
+    batch, width, rows, columns = bev.shape
+    x, y = positions[..., 0] * columns - 0.5, (1.0 - positions[..., 1]) * rows - 0.5
+    cells, shares = bilinear_corners(x, y, columns, rows)
+    cells += torch.arange(batch, dtype=torch.int32)[:, None, None, None, None] * (rows * columns)
+    table = bev.permute(0, 2, 3, 1).reshape(-1, width)
+    return weighted_rows(table, cells.view(-1, 4), shares.view(-1, 4)).view(*positions.shape[:-1], width)
 
 
 def visible_rows(track_valid: Tensor, queries: int, one_way: bool) -> Tensor:

@@ -176,8 +176,8 @@ def to_ground(features: Tensor, camera_valid: Tensor, lookup: GroundLookup) -> T
     Returns:
         ``(B, K, C)``; zero where no valid camera looks.
     """
-    features = features.masked_fill(~camera_valid[:, :, None, None, None], 0.0)
-    table = features.permute(0, 1, 3, 4, 2).reshape(-1, features.shape[2]).to(lookup.gather.weights.dtype)
+    pixels = features.movedim(2, -1).masked_fill(~camera_valid[:, :, None, None, None], 0.0)
+    table = pixels.reshape(-1, features.shape[2]).to(lookup.gather.weights.dtype)
     seeing = lookup.visible.to(table.dtype) @ camera_valid.to(table.dtype)[..., None]
     cameras = seeing.clamp(min=1.0).flatten(0, 1)
     if torch.is_grad_enabled():

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import LookupBevConfig, PredMapNetConfig
-from predmapnet.network.ego_motion import relative_motion, warp_bev
+from predmapnet.network.ego_motion import cells_in_past, relative_motion, warp_bev
+from predmapnet.network.kernels.bilinear_sampling import bilinear_corners, samples_by_rows, weighted_rows
 from predmapnet.network.layers import Pointwise, zero_init
 from predmapnet.network.state import StreamState
 
@@ -45,21 +46,42 @@ class ResidualBevMemory(nn.Module):
         """
         past, reached = self._look_back(ego_to_global, state)
         hidden = torch.relu(self.mix(torch.cat([past, reached, raw], dim=1)))
-        known = state.bev_memory_valid.any(dim=1)[:, None, None, None]
+        known = state.bev_memory_valid.any(dim=1)[:, None, None, None].to(fine.dtype)
         return (
-            torch.where(known, fine + self.fine_residual(hidden), fine),
-            torch.where(known, middle + self.middle_residual(hidden), middle),
+            torch.addcmul(fine, self.fine_residual(hidden), known),
+            torch.addcmul(middle, self.middle_residual(hidden), known),
         )
 
     def _look_back(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
         """Return the warped maps ``(B, D * C_bev, H, W)`` and where they reach ``(B, D, H, W)``."""
         chosen, valid = self._choose(ego_to_global, state)
         stream = torch.arange(len(chosen), device=chosen.device)[:, None]
+        motion = relative_motion(ego_to_global[:, None], state.bev_memory_pose[stream, chosen])
+        if samples_by_rows(state.bev_memory):
+            return self._rows_of_maps(state.bev_memory, chosen, valid, motion)
         maps = state.bev_memory[stream, chosen].flatten(0, 1)
-        motion = relative_motion(ego_to_global[:, None], state.bev_memory_pose[stream, chosen]).flatten(0, 1)
-        warped = warp_bev(torch.cat([maps, torch.ones_like(maps[:, :1])], dim=1), motion, self.roi)
+        warped = warp_bev(torch.cat([maps, torch.ones_like(maps[:, :1])], dim=1), motion.flatten(0, 1), self.roi)
         warped = (warped * valid.flatten()[:, None, None, None]).unflatten(0, chosen.shape)
         return warped[:, :, :-1].flatten(1, 2), warped[:, :, -1]
+
+    def _rows_of_maps(self, maps: Tensor, chosen: Tensor, valid: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the same by :func:`weighted_rows`: a cell's samples of all maps lie side by side in memory.
+
+        Args:
+            maps: ``(B, K, C_bev, H, W)``.
+            chosen: ``(B, D) int64``, which of them are warped.
+            valid: ``(B, D) bool``.
+            motion: ``(B, D, 2, 3)``, metres, from the current frame to theirs.
+        """
+        batch, kept, channels, rows, columns = maps.shape
+        x, y = cells_in_past(rows, columns, motion, self.roi)
+        cells, shares = bilinear_corners(x * columns - 0.5, (1.0 - y) * rows - 0.5, columns, rows)
+        first = chosen.int() + torch.arange(batch, dtype=torch.int32)[:, None] * kept
+        cells += (first * (rows * columns))[:, None, None, :, None]
+        shares *= valid[:, None, None, :, None]
+        table = maps.movedim(2, -1).reshape(-1, channels)
+        warped = weighted_rows(table, cells.view(-1, 4), shares.view(-1, 4)).view(batch, rows, columns, -1)
+        return warped.movedim(-1, 1), shares.sum(dim=-1).movedim(-1, 1)
 
     def _choose(self, ego_to_global: Tensor, state: StreamState) -> tuple[Tensor, Tensor]:
         """Find the nearest stored map for each distance ``(B, D)``; validity, as a map serves only one of them."""
@@ -76,7 +98,8 @@ def store_raw_map(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the BEV memory (maps, poses, validity) with the raw map ``(B, C_bev, H, W)`` of this frame, newest last.
 
-    The newest one is replaced until the car has moved ``spacing`` metres past the one before.
+    The newest one is replaced until the car has moved ``spacing`` metres past the one before. Maps are channels-last in
+    memory, as they are made and looked up.
     """
     pose, valid, maps = state.bev_memory_pose, state.bev_memory_valid, state.bev_memory
     if valid.shape[1] == 0:
@@ -89,7 +112,7 @@ def store_raw_map(
     slots = torch.arange(valid.shape[1] - 1, device=valid.device)[None] + step
     stream = torch.arange(len(valid), device=valid.device)[:, None]
     return (
-        torch.cat([maps[stream, slots], raw[:, None]], dim=1),
+        torch.cat([maps.movedim(2, -1)[stream, slots], raw.movedim(1, -1)[:, None]], dim=1).movedim(-1, 2),
         torch.cat([pose[stream, slots], ego_to_global[:, None]], dim=1),
         torch.cat([valid[stream, slots], valid.new_ones(len(valid), 1)], dim=1),
     )
