@@ -99,20 +99,21 @@ def find_on_ground(
     batch, cameras = calibration.camera_code.shape
     u, v, depth = _project(points, calibration)
     width, height = calibration.image_size[..., None].unbind(2)
-    seen = (depth > NEAREST_DEPTH) & (u >= 0) & (v >= 0) & (u < width * depth) & (v < height * depth)
+    seen = depth > NEAREST_DEPTH
+    for inside in (u >= 0, v >= 0, u < width * depth, v < height * depth):
+        seen &= inside
     visible = seen.transpose(1, 2)
     # Point after point, so that the entries of each row follow one another.
     frame, point, camera = visible.nonzero(as_tuple=True)
     view = frame * cameras + camera
     u, v, depth = (value.flatten().index_select(0, view * len(points) + point) for value in (u, v, depth))
-    corners, shares = _bilinear(u / depth / stride - 0.5, v / depth / stride - 0.5, *feature_size)
     pixels = feature_size[0] * feature_size[1]
-    first_pixel = (view * pixels).int()
+    corners, shares = _bilinear(
+        u / depth / stride - 0.5, v / depth / stride - 0.5, *feature_size, (view * pixels).int()
+    )
     return GroundLookup(
         gather=SparseRows(
-            columns=(corners + first_pixel[:, None]).flatten(),
-            starts=row_starts(4 * seen.sum(dim=1).flatten()),
-            weights=shares.flatten().float(),
+            columns=corners.flatten(), starts=row_starts(4 * seen.sum(dim=1).flatten()), weights=shares.flatten()
         ),
         pixels=batch * cameras * pixels,
         visible=visible.float(),
@@ -133,13 +134,16 @@ def _project(points: Tensor, calibration: Calibration) -> tuple[Tensor, Tensor, 
     return u, v, depth
 
 
-def _bilinear(x: Tensor, y: Tensor, rows: int, columns: int) -> tuple[Tensor, Tensor]:
-    """Return the four neighbours ``(n, 4) int32`` of each position (flat, clamped at the border) and their weights."""
+def _bilinear(x: Tensor, y: Tensor, rows: int, columns: int, first: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the four neighbours ``(n, 4) int32`` of each position (flat, clamped at the border) and their weights.
+
+    ``first (n,) int32`` is where the pixels of each position's map begin.
+    """
     left, top = x.floor(), y.floor()
-    right, down = x - left, y - top
+    right, down = (x - left).float(), (y - top).float()
     left, top = left.int(), top.int()
     near_x, far_x = left.clamp(0, columns - 1), (left + 1).clamp(0, columns - 1)
-    near_y, far_y = top.clamp(0, rows - 1) * columns, (top + 1).clamp(0, rows - 1) * columns
+    near_y, far_y = (row.clamp(0, rows - 1) * columns + first for row in (top, top + 1))
     corners = torch.stack([near_y + near_x, far_y + near_x, near_y + far_x, far_y + far_x], dim=-1)
     shares = [(1 - right) * (1 - down), (1 - right) * down, right * (1 - down), right * down]
     return corners, torch.stack(shares, dim=-1)
