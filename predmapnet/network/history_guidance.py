@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from predmapnet.config import PredMapNetConfig
-from predmapnet.network.layers import SINE_FREQUENCIES, Attention, cell_centres, flatten_cells, sine_code, zero_init
+from predmapnet.network.layers import Attention, CellCode, flatten_cells, zero_init
 
 
 class HistoryMapGuidance(nn.Module):
@@ -20,7 +20,7 @@ class HistoryMapGuidance(nn.Module):
         width = config.decoder.width
         self.threshold = config.history_map.threshold
         self.input = nn.Linear(config.bev.widths[config.mask_level], width)
-        self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, width)
+        self.cell_code = CellCode(width)
         self.class_code = nn.Embedding(config.decoder.classes, width)
         self.cross_attention = Attention(width, config.decoder.heads)
         zero_init(self.cross_attention.output)
@@ -36,9 +36,7 @@ class HistoryMapGuidance(nn.Module):
         """
         if queries.shape[1] == 0:
             return queries
-        rows, columns = bev.shape[-2:]
-        code = self.cell_code(sine_code(cell_centres(rows, columns, bev.device), SINE_FREQUENCIES).flatten(0, 1))
-        sampled = self.input(flatten_cells(bev)) + code
+        sampled = self.input(flatten_cells(bev)) + self.cell_code.of_grid(*bev.shape[-2:])
         valid = history_maps.detach().flatten(2) > self.threshold
         some = valid.any(dim=-1, keepdim=True)
         refined = self.cross_attention(queries + self.class_code(labels), sampled, sampled, valid | ~some)

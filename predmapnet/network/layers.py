@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from predmapnet.network.kernels.matrix_product import Linear
+from predmapnet.network.kernels.tracing import is_traced
 
 
 class Attention(nn.Module):
@@ -160,6 +161,29 @@ def cell_centres(rows: int, columns: int, device: torch.device | None = None) ->
     x = (torch.arange(columns, device=device) + 0.5) / columns
     y = 1.0 - (torch.arange(rows, device=device) + 0.5) / rows
     return torch.stack(torch.broadcast_tensors(x[None, :], y[:, None]), dim=-1)
+
+
+class CellCode(nn.Linear):
+    """Code of the places of a grid's cells: a linear layer of their sines.
+
+    Attributes:
+        known: codes by rows, columns and device, in a network whose weights no longer change
+            (:func:`predmapnet.network.kernels.inference.for_inference`); None in others.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__(4 * SINE_FREQUENCIES, width)
+        self.known: dict[tuple[int, int, torch.device], Tensor] | None = None
+
+    def of_grid(self, rows: int, columns: int) -> Tensor:
+        """Return the code ``(rows * columns, C)`` of a grid over the ROI."""
+        key = rows, columns, self.weight.device
+        if self.known is not None and key in self.known:
+            return self.known[key]
+        code: Tensor = self(sine_code(cell_centres(rows, columns, self.weight.device), SINE_FREQUENCIES).flatten(0, 1))
+        if self.known is not None and not is_traced():
+            self.known[key] = code
+        return code
 
 
 def flatten_cells(features: Tensor) -> Tensor:

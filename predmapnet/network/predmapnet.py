@@ -177,7 +177,7 @@ class PredMapNet(nn.Module):
 
         Arguments are those of :meth:`forward`.
         """
-        if state is None:
+        if state is None and isinstance(self.config.bev, BevFormerConfig):
             state = self.initial_state(len(inputs.camera_valid))
         if geometry is None:
             rows, columns = inputs.images.shape[-2:]

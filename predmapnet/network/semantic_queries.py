@@ -9,15 +9,7 @@ from torch import Tensor, nn
 
 from predmapnet.config import PointDecoderConfig, PredMapNetConfig
 from predmapnet.network.instance_masks import MaskHead, attention_cells
-from predmapnet.network.layers import (
-    SINE_FREQUENCIES,
-    Attention,
-    FeedForward,
-    Perceptron,
-    cell_centres,
-    flatten_cells,
-    sine_code,
-)
+from predmapnet.network.layers import Attention, CellCode, FeedForward, Perceptron, flatten_cells
 
 
 @dataclass
@@ -88,7 +80,7 @@ class SemanticAwareQueryGenerator(nn.Module):
         count = config.semantic_queries.layers
         self.layers = nn.ModuleList(MaskedAttentionLayer(decoder.width, decoder.heads) for _ in range(count))
         self.level_inputs = nn.ModuleList(nn.Linear(width, decoder.width) for width in config.bev.widths[::-1][:count])
-        self.cell_code = nn.Linear(4 * SINE_FREQUENCIES, decoder.width)
+        self.cell_code = CellCode(decoder.width)
         self.classify = nn.Linear(decoder.width, decoder.classes) if isinstance(decoder, PointDecoderConfig) else None
         if self.classify is not None:
             nn.init.constant_(self.classify.bias, -3.0)
@@ -113,9 +105,7 @@ class SemanticAwareQueryGenerator(nn.Module):
             for number, layer in enumerate(self.layers):
                 turn = number % len(inputs)
                 rows, columns = levels[turn].shape[-2:]
-                code = self.cell_code(
-                    sine_code(cell_centres(rows, columns, queries.device), SINE_FREQUENCIES).flatten(0, 1)
-                )
+                code = self.cell_code.of_grid(rows, columns)
                 allowed = attention_cells(masks[-1].detach(), (rows, columns), self.threshold)
                 queries = layer(queries, self.position, inputs[turn], code, allowed)
                 logits += self._names(queries)

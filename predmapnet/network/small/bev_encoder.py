@@ -42,7 +42,7 @@ class BevEncoder(nn.Module):
             self.heights = Linear(len(bev.further_heights) * channels_in, fine, bias=False)
             zero_init(self.heights)
         self.position = nn.Parameter(torch.randn(fine, *grid) * 0.02)
-        self.norm = nn.BatchNorm2d(fine)
+        self.norm: nn.Module = nn.BatchNorm2d(fine)
         self.fine_in = ResidualBlock(fine, fine)
         self.middle_in = ResidualBlock(fine, middle, stride=2)
         self.coarse = ResidualBlock(middle, coarse, stride=2)
@@ -68,7 +68,7 @@ class BevEncoder(nn.Module):
         """
         assert isinstance(geometry, GroundLookup), "the geometry comes from this encoder"
         found = to_ground(levels[0], inputs.camera_valid, geometry)
-        fine = self.fine_in(F.relu(self.norm(self._combined(found) + self.position)))
+        fine = self.fine_in(F.relu(self.norm(self._combined(found) + self.position), inplace=True))
         middle = self.middle_in(fine)
         coarse = self.coarse(middle)
         middle = self.middle_out(middle + _resize(self.coarse_to_middle(coarse), middle))

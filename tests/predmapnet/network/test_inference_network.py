@@ -38,3 +38,17 @@ def test_norms_of_the_small_backbone_are_folded():
 
 def test_norms_of_the_deformable_backbone_are_folded():
     assert_same_without_norms(with_any_statistics(ResNet50()), torch.randn(1, 3, 64, 96))
+
+
+def test_norm_and_codes_of_the_whole_network_are_computed_once(network, make_inputs):
+    network = with_any_statistics(network)
+    faster = for_inference(network)
+    inputs = make_inputs(1)
+    with torch.no_grad():
+        expected, found, again = network(inputs), faster(inputs), faster(inputs)
+    assert isinstance(faster.bev_encoder.norm, nn.Identity) and len(faster.query_generator.cell_code.known) > 0
+    assert network.query_generator.cell_code.known is None
+    for name in ("queries", "segmentation", "bev"):
+        one, other = getattr(found, name), getattr(expected, name)
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4 * float(other.abs().max()))
+        assert torch.equal(getattr(again, name), one)
