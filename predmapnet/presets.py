@@ -13,6 +13,7 @@ from predmapnet.config import (
     EncoderQuirks,
     FutureConfig,
     HistoryMapConfig,
+    ImageWindowConfig,
     LookupBevConfig,
     MapTrackerDecoderConfig,
     MaskConfig,
@@ -75,7 +76,10 @@ PRESETS = {
     config.name: config
     for config in (
         PredMapNetConfig(
-            name="lite", bev=LookupBevConfig(further_heights=(-0.5, 0.5)), future=FutureConfig(steady_motion=True)
+            name="lite",
+            image=ImageWindowConfig(width=384, height=144),
+            bev=LookupBevConfig(further_heights=(-0.5, 0.5)),
+            future=FutureConfig(steady_motion=True),
         ),
         _paper("paper-nuscenes", _NUSCENES),
         _paper("paper-av2", _ARGOVERSE2),

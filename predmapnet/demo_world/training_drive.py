@@ -24,8 +24,8 @@ from predmapnet.scenes import Camera, FrameTruth, Rig
 
 EDGE_SAMPLES = 2
 """Samples per pixel and direction along the edges of solids."""
-TEXEL = 0.07
-"""Metres of the ground's texture, finer than a pixel of the network sees it beyond 10 m."""
+TEXEL = 0.05
+"""Metres of the ground's texture, about a pixel of the network at 15 m."""
 SCALING_BLUR = 1.0
 """Standard deviation by which scaling photographs down blurs them, pixels of an image 800 wide."""
 

@@ -38,7 +38,7 @@ from predmapnet.scenes import Frame, FrameTruth, Image, Report, Scene, SceneSour
 
 REPORT_SECONDS = 10.0
 BYTES_PER_IMAGE, BYTES_PER_PIXEL = 5000, 0.25
-"""Of the JPEGs: measured on photographs of nuScenes at 480 x 800 and on demo towns at 96 x 256."""
+"""Of the JPEGs: measured on photographs of nuScenes at 480 x 800 and on demo towns at 144 x 384."""
 
 
 class FilledFrame(NamedTuple):
