@@ -130,7 +130,7 @@ def normalise_images(images: Tensor, config: ImageConfig) -> Tensor:
         ``(..., 3, rows, columns) float32`` of :func:`input_size`, channels-last in memory. Red, green, blue for a
         window; blue, green, red for whole images.
     """
-    # Of whole rows of pixels: an operation that begins anew with every pixel takes ten times as long.
+    # Of whole rows of pixels: an operation that begins anew with every pixel takes several times as long.
     pixels = images.shape[-2]
     mean = torch.tensor(config.mean, device=images.device).repeat(pixels)
     if isinstance(config, WholeImageConfig):

@@ -12,7 +12,7 @@ MANY_ROWS = 512
 """Fewer rows are no work for a convolution."""
 
 MANY_PRODUCTS = 2**26
-"""Multiply-adds from which on a convolution's greater overhead pays; below, MKL is as fast or up to twice as fast."""
+"""Multiply-adds from which on a convolution's greater overhead pays; below, MKL is as fast or faster."""
 
 ONEDNN = torch.backends.mkldnn.is_available()
 

@@ -141,7 +141,7 @@ def sample_bev(bev: Tensor, positions: Tensor) -> Tensor:
 
 
 def _rows_of_bev(bev: Tensor, positions: Tensor) -> Tensor:
-    """Return the same by :func:`weighted_rows`, on a CPU three times as fast where channels are last in memory."""
+    """Return the same by :func:`weighted_rows`, on a CPU faster where channels are last in memory."""
     batch, width, rows, columns = bev.shape
     x, y = positions[..., 0] * columns - 0.5, (1.0 - positions[..., 1]) * rows - 0.5
     cells, shares = bilinear_corners(x, y, columns, rows)
