@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Lock
 from typing import Any, Protocol
 
 import torch
@@ -45,7 +46,7 @@ class Engine(Protocol):
     device: torch.device
 
     def features(self, inputs: FrameInputs) -> Any:
-        """Compute what a frame gives without memory; another thread may do that while a step runs."""
+        """Compute what a frame gives without memory; other threads may do that while a step runs."""
 
     def step(self, inputs: FrameInputs, state: StreamState | None, features: Any = None) -> EngineStep:
         """Map one frame; a state of None begins a stream, and the one given is not changed.
@@ -73,6 +74,7 @@ class TorchEngine:
         if compiled:
             compile_features(self.network)
         self._geometries: dict[bytes, ViewGeometry] = {}
+        self._looking_up = Lock()
 
     def features(self, inputs: FrameInputs) -> ImageFeatures | BevFeatures:
         """Compute image features, and BEV features where no BEV memory takes part in them."""
@@ -99,10 +101,11 @@ class TorchEngine:
     def _geometry(self, calibration: Calibration) -> ViewGeometry:
         """Return the geometry of a calibration, from the few that were used last."""
         key = calibration.fingerprint()
-        geometry = self._geometries.pop(key, None)
-        if geometry is None:
-            geometry = self.network.view_geometry(calibration)
-        self._geometries[key] = geometry
-        if len(self._geometries) > CALIBRATIONS_KEPT:
-            self._geometries.pop(next(iter(self._geometries)), None)  # another thread may have been first
+        with self._looking_up:
+            geometry = self._geometries.pop(key, None)
+            if geometry is None:
+                geometry = self.network.view_geometry(calibration)
+            self._geometries[key] = geometry
+            if len(self._geometries) > CALIBRATIONS_KEPT:
+                self._geometries.pop(next(iter(self._geometries)))
         return geometry

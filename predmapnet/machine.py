@@ -45,7 +45,7 @@ class NetworkOptions:
         precision: of the image backbone and the BEV encoder.
         compiled: whether these two are compiled, which delays the first frames.
         engine: what computes the network; ``onnx`` exports a checkpoint first, a folder of graphs is always its.
-        ahead: whether a second thread computes the next frame's features meanwhile; where as many scenes are mapped at
+        ahead: whether other threads compute the next frames' features meanwhile; where as many scenes are mapped at
             a time as there are cores, it gains nothing.
     """
 

@@ -65,7 +65,7 @@ class Mapper:
         precision: of the image backbone and the BEV encoder (:mod:`predmapnet.network.kernels.low_precision`).
         compiled: whether these two are compiled.
         engine: what computes the network.
-        ahead: whether :func:`predmapnet.mapping.map_scene` lets it :meth:`see` the next frame during a step.
+        ahead: whether :func:`predmapnet.mapping.map_scene` lets it :meth:`see` the next frames during a step.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class Mapper:
         return self.config.roi
 
     def read_images(self, frame: Frame, *, allow_missing_cameras: bool = False) -> CameraImages:
-        """Read and crop the images of a frame; safe to call from another thread while a step runs.
+        """Read and crop the images of a frame; safe to call from other threads while a step runs.
 
         Args:
             frame: names the images.
@@ -134,7 +134,7 @@ class Mapper:
 
     @torch.inference_mode()
     def see(self, frame: Frame, images: CameraImages) -> SeenFrame:
-        """Compute what needs no memory of a frame; safe to call from another thread while a step runs."""
+        """Compute what needs no memory of a frame; safe to call from other threads while a step runs."""
         device = self.engine.device
         inputs = FrameInputs(
             images=normalise_images(torch.from_numpy(images.windows)[None].to(device), self.config.image),

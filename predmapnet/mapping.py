@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from threading import Lock
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol
 
@@ -31,6 +33,10 @@ than with the truth. The common part was chosen on the validation towns of the d
 
 FRAMES_BETWEEN_TRIMS = 100
 """So rarely that it costs nothing, and often enough that a long drive needs no more memory than a short one."""
+
+FRAMES_AHEAD = 2
+"""Frames that are seen while another is mapped, each by a thread of its own: to read and to see one costs more than the
+rest of it, so a single thread would let cores wait."""
 
 MapSnapshot = Callable[[], GlobalMap]
 """Returns the global map as it is now; its cost grows with the map, so it is for every few frames."""
@@ -150,24 +156,26 @@ def check_left_out(frames: int, fused: int, rejections: Mapping[str, int]) -> No
 def stream(
     scene: Scene, mapper: Mapper, integrator: MapIntegrator, allow_missing_cameras: bool = False
 ) -> Iterator[Step]:
-    """Map frame after frame, adding each to the integrator; the next one is read, or even seen, meanwhile."""
-    state = None
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="images") as reader:
+    """Map frame after frame, adding each to the integrator; the next ones are read, or even seen, meanwhile."""
+    state, one_at_a_time = None, Lock()
+    threads = FRAMES_AHEAD if mapper.ahead else 1
+    with ThreadPoolExecutor(threads, thread_name_prefix="images") as reader:
 
         def read(index: int) -> tuple[Frame, CameraImages | SeenFrame]:
-            frame = scene.frame(index)
+            with one_at_a_time:  # A scene may keep a file open.
+                frame = scene.frame(index)
             images = mapper.read_images(frame, allow_missing_cameras=allow_missing_cameras)
             return frame, mapper.see(frame, images) if mapper.ahead else images
 
-        upcoming = reader.submit(read, 0)
+        upcoming = deque(reader.submit(read, index) for index in range(min(threads, len(scene))))
         for index in range(len(scene)):
             if index and index % FRAMES_BETWEEN_TRIMS == 0:
                 trim_memory()
             asked = perf_counter()
-            frame, images = upcoming.result()
+            frame, images = upcoming.popleft().result()
             images_ready = perf_counter()
-            if index + 1 < len(scene):
-                upcoming = reader.submit(read, index + 1)
+            if index + threads < len(scene):
+                upcoming.append(reader.submit(read, index + threads))
             frame_map, state = mapper.step(frame, state, images=images)
             mapped = perf_counter()
             before = integrator.frames
