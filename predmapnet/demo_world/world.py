@@ -208,7 +208,7 @@ class Clutter:
 class World:
     """Everything that the renderer needs to draw one scene. Deterministic in ``seed``.
 
-    The trajectory stands on the terrain; None is flat ground.
+    The trajectory stands on the terrain; None is flat ground. What is no road lies ``kerb_height`` metres higher.
     """
 
     name: str
@@ -220,3 +220,4 @@ class World:
     solids: Solids = field(repr=False)
     clutter: Clutter = field(default_factory=Clutter, repr=False)
     terrain: Terrain | None = field(default=None, repr=False)
+    kerb_height: float = 0.0

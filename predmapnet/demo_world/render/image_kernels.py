@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from mapfusion.arrays import Byte, Float, Float32, Integer
-from predmapnet.demo_world.render.ground_texture import Pyramid
+from predmapnet.demo_world.render.ground_light import (
+    Surroundings,
+    ground_colour,
+    ground_met,
+    hazy,
+    kerb_colour,
+    light_at,
+    sort_ground,
+)
 from predmapnet.demo_world.render.jit import kernel, part
+from predmapnet.demo_world.render.kerbs import FACE, Kerbs
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.raster import Vector, View, ZBuffer, ball_depth, pixel_ray
 from predmapnet.demo_world.render.relief import (
-    Footing,
     Relief,
     facing_of,
     first_guess,
@@ -22,92 +28,7 @@ from predmapnet.demo_world.render.relief import (
     mirrored_ray,
     stand_of,
 )
-from predmapnet.demo_world.render.shading import Colour, facade, headlight, lamp_light, read_ground, sky, smooth_noise
-from predmapnet.demo_world.street.looks import Light
-
-
-class Surroundings(NamedTuple):
-    """All that is the same for every pixel of an image.
-
-    Attributes:
-        fine, coarse: the ground.
-        light: light of the scene.
-        white, fractal, clouds: noise tiles.
-        lamps: ``(rows, columns) float32``, light of street lamps on the ground, one cell per metre.
-        lamps_origin: of the lamps' cell (0, 0), metres.
-        global_to_ego: ``(4, 4) float64``.
-        sunlit: ``(solids,) float32``, share of the sun that reaches the foot of each solid.
-        styles: ``(solids, 6) float64``, of facades.
-    """
-
-    fine: Pyramid
-    coarse: Pyramid
-    light: Light
-    white: Float32
-    fractal: Float32
-    clouds: Float32
-    lamps: Float32
-    lamps_origin: tuple[float, float]
-    global_to_ego: Float
-    sunlit: Float32
-    styles: Float
-
-
-@part
-def _hazy(light: Light, colour: Colour, distance: float) -> Colour:
-    clear = np.exp(-light.haze * distance)
-    return (
-        colour[0] * clear + (1 - clear) * light.horizon[0],
-        colour[1] * clear + (1 - clear) * light.horizon[1],
-        colour[2] * clear + (1 - clear) * light.horizon[2],
-    )
-
-
-@part
-def _lit(
-    around: Surroundings, x: float, y: float, z: float, height: float, sun: float, ambient: float, facing: float
-) -> Colour:
-    """Irradiance from the sun, the sky, headlights (``facing``: cosine towards the car) and lamps.
-
-    ``height`` is that above the ground.
-    """
-    light = around.light
-    lamps = 0.0
-    if light.lamps > 0:
-        lamps = light.lamps * lamp_light(around.lamps, around.lamps_origin, x, y)
-    beam = 0.0
-    if light.headlights > 0:
-        beam = headlight(light, around.global_to_ego, x, y, z, height) * facing
-    return (
-        light.sun[0] * sun + light.ambient[0] * ambient + beam + 1.0 * lamps,
-        light.sun[1] * sun + light.ambient[1] * ambient + 0.96 * beam + 0.72 * lamps,
-        light.sun[2] * sun + light.ambient[2] * ambient + 0.88 * beam + 0.42 * lamps,
-    )
-
-
-@part
-def _ground_colour(
-    around: Surroundings, relief: Relief | None, view: View, ray: Vector, foot: Footing, dynamic: float, most: int
-) -> Colour:
-    """Radiance of the ground that a pixel sees along ``ray`` (camera depth 1) at ``foot``."""
-    rotation, light, depth = view.rotation, around.light, foot.depth
-    x, y = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1]
-    along, right, down, upright = facing_of(relief, view, ray, foot)
-    tilt_u, tilt_v = right / view.focal_x / along, down / view.focal_y / along
-    ux = depth * (rotation[0, 0] / view.focal_x - ray[0] * tilt_u)
-    uy = depth * (rotation[1, 0] / view.focal_x - ray[1] * tilt_u)
-    vx = depth * (rotation[0, 1] / view.focal_y - ray[0] * tilt_v)
-    vy = depth * (rotation[1, 1] / view.focal_y - ray[1] * tilt_v)
-    red, green, blue, shade = read_ground(around.fine, around.coarse, around.white, x, y, ux, uy, vx, vy, most)
-    distance = depth * np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-    sun, z, eye = light.sun_direction[2], 0.0, view.position[2]
-    if relief is not None:
-        sun = max(0.0, sun - foot.east * light.sun_direction[0] - foot.north * light.sun_direction[1]) * upright
-        z, eye = view.position[2] + depth * ray[2], -depth * along * upright
-    sun *= shade * (1.0 if dynamic > 0.99 else dynamic)
-    facing = min(1.0, 0.25 + 3.0 * eye / distance)
-    lit = _lit(around, x, y, z, 0.0, sun, (0.75 + 0.25 * shade) * (0.25 + 0.75 * dynamic), facing)
-    return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), distance)
+from predmapnet.demo_world.render.shading import Colour, facade, sky, smooth_noise
 
 
 @part
@@ -151,7 +72,7 @@ def _face_colour(
     # Close to the ground less of the sky is seen, but light comes back from the road.
     ambient = (0.62 + 0.38 * nz) * (0.6 + 0.4 * min(1.0, height / 1.2))
     towards = -(nx * ray[0] + ny * ray[1] + nz * ray[2]) / length
-    lit = _lit(around, x, y, z, height, sun, ambient, max(0.0, towards))
+    lit = light_at(around, x, y, z, height, sun, ambient, max(0.0, towards))
     colour = (red * lit[0], green * lit[1], blue * lit[2])
     if material == 4 or material == 5 or glass > 0.02:
         mirror = _sky_mirror(around, ray, length, nx, ny, nz)
@@ -173,7 +94,7 @@ def _face_colour(
             colour = (colour[0] + 1.3 * light.lamps, colour[1] + 0.08 * light.lamps, colour[2] + 0.06 * light.lamps)
         elif material == 8 and nz < -0.5:
             colour = (colour[0] + 6.0 * light.lamps, colour[1] + 4.6 * light.lamps, colour[2] + 3.0 * light.lamps)
-    return _hazy(light, colour, depth * length)
+    return hazy(light, colour, depth * length)
 
 
 @part
@@ -210,31 +131,33 @@ def _ball_colour(
         shine *= 0.5 + clump
         ambient *= 0.55 + 0.45 * min(1.0, max(0.0, (z - balls[index, 2]) / balls[index, 5] + 1.0))
     height = height_over_foot(relief, mesh.ball_owners[index], z)
-    lit = _lit(around, x, y, z, height, max(0.0, shine), ambient, 0.7)
-    return _hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), depth * length)
+    lit = light_at(around, x, y, z, height, max(0.0, shine), ambient, 0.7)
+    return hazy(light, (red * lit[0], green * lit[1], blue * lit[2]), depth * length)
 
 
 @kernel
 def shade_image(
-    around: Surroundings, relief: Relief | None, mesh: Mesh, view: View, samples: int, most: int, solids: ZBuffer,
-    dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32, ground_share: Float32,
+    around: Surroundings, relief: Relief | None, kerbs: Kerbs | None, mesh: Mesh, view: View, samples: int, most: int,
+    solids: ZBuffer, dynamic: Byte, found: Integer, scratch: Float, image: Float32, depth: Float32,
+    ground_share: Float32,
 ) -> None:  # fmt: skip
     """Shade all pixels; each face in a pixel is shaded once, weighted by the samples that it covers.
 
     Args:
         around, mesh, view: what is seen.
-        relief: slopes of the ground; None compiles loops for flat ground.
+        relief, kerbs: slopes and steps of the ground; None compiles loops for ground without.
         samples: per pixel and direction.
         most: largest number of ground samples along a footprint.
         solids: z-buffer.
         dynamic: ``(height, width)``, 255 where no moving thing darkens the ground.
-        found, scratch: ``(16,)`` and ``(4, 16)``, overwritten.
+        found, scratch: ``(16,)`` and ``(8, 16)``, overwritten.
         image: ``(height, width, 3)`` receives linear radiance.
         depth: ``(height, width)`` receives metres along the optical axis, infinite for the sky.
         ground_share: ``(height, width)`` receives how much of a pixel is ground.
     """
     faces = len(mesh.counts)
     weight, sum_x, sum_y, close = scratch[0], scratch[1], scratch[2], scratch[3]
+    kinds_of_ground = scratch[4:]
     each = 1.0 / (samples * samples)
     stand = stand_of(relief, view.position)
     foot = first_guess(view, stand)
@@ -278,8 +201,24 @@ def shade_image(
                 if number < 0:
                     foot = footing(relief, view, stand, ray, foot, least_depth(relief, solids.ground, row, column))
                     here = foot.depth
-                    if here < np.inf:
-                        colour = _ground_colour(around, relief, view, ray, foot, dynamic[row, column] / 255.0, most)
+                    if here < np.inf and kerbs is not None:
+                        light_left = dynamic[row, column] / 255.0
+                        here -= sort_ground(kerbs, relief, view, x, y, foot, kinds_of_ground)
+                        colour = (0.0, 0.0, 0.0)
+                        for kind in range(3):
+                            share = kinds_of_ground[kind, 0]
+                            if share == 0:
+                                continue
+                            met, ray = ground_met(relief, view, foot, kinds_of_ground[kind])
+                            seen = kerb_colour(around, relief, kerbs, view, ray, met, light_left, most, kind)
+                            colour = (
+                                colour[0] + share * seen[0],
+                                colour[1] + share * seen[1],
+                                colour[2] + share * seen[2],
+                            )
+                        share_of_ground += part * (1 - kinds_of_ground[FACE, 0])
+                    elif here < np.inf:
+                        colour = ground_colour(around, relief, view, ray, foot, dynamic[row, column] / 255.0, most)
                         share_of_ground += part
                     else:
                         length = np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapfusion.arrays import Float
+from predmapnet.demo_world.render.kerbs import step_along
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.relief import Relief, meet_along
 from predmapnet.demo_world.render.renderer import Renderer
@@ -105,7 +106,10 @@ def scan(renderer: Renderer, frame_index: int, lidar_to_ego: Float = LIDAR_TO_EG
         buffer = renderer.rasterise(mesh, renderer.view(eye, frame_index), 1).ids
         chosen = sector.chosen
         ids[chosen] = buffer[sector.rows, sector.columns]
-        distance[chosen] = _hit_distance(mesh, renderer.relief, ids[chosen], origin, rays_global[chosen])
+        met = _hit_distance(mesh, renderer.relief, ids[chosen], origin, rays_global[chosen])
+        if renderer.kerbs is not None:
+            step_along(renderer.kerbs, renderer.relief, origin, rays_global[chosen], ids[chosen], met)
+        distance[chosen] = met
     generator = np.random.default_rng([renderer.world.seed, 53, frame_index])
     noisy = distance + generator.normal(0, 0.015, len(distance))
     kept = (distance > 1.0) & (distance < RANGE)

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
-from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, paint_ground
-from predmapnet.demo_world.render.image_kernels import Surroundings, develop, mirror_in_wet, shade_image
+from predmapnet.demo_world.render.ground_light import Surroundings
+from predmapnet.demo_world.render.ground_texture import FINE_TEXEL, Pyramid, paint_ground, road_of
+from predmapnet.demo_world.render.image_kernels import develop, mirror_in_wet, shade_image
+from predmapnet.demo_world.render.kerbs import Kerbs, heights_at, kerbs_of
 from predmapnet.demo_world.render.mesh import MOST_CORNERS, Material, Mesh, build_mesh, join
 from predmapnet.demo_world.render.noise import fractal_tile
 from predmapnet.demo_world.render.raster import View, ZBuffer, draw_balls, draw_faces, draw_mask
@@ -77,6 +79,14 @@ def _in_sight(relief: Relief, view: View, corners: Float, counts: NDArray[np.int
     return corners[met > 0.98], counts[met > 0.98]
 
 
+def _on_kerbs(world: World, kerbs: Kerbs) -> World:
+    """Put what stands still on the raised ground below its middle."""
+    rise = np.zeros(len(world.solids.centre))
+    heights_at(kerbs, world.solids.centre, rise)
+    rise[world.solids.velocity.any(axis=1)] = 0.0
+    return replace(world, solids=replace(world.solids, centre=world.solids.centre + [[0.0, 0.0, 1.0]] * rise[:, None]))
+
+
 class Renderer:
     """Draws one world; prepares the ground once (about two seconds), then renders any camera at any frame.
 
@@ -100,7 +110,8 @@ class Renderer:
     ) -> None:
         if not 1 <= supersampling <= 4:
             raise ValueError(f"supersampling must be 1 to 4, not {supersampling}")
-        self.world = world
+        self.kerbs = kerbs_of(world, road_of(world))
+        self.world = world = world if self.kerbs is None else _on_kerbs(world, self.kerbs)
         self.supersampling = supersampling
         self.threads = threads
         self.light = light_of(world.look, world.seed) if light is None else light
@@ -237,10 +248,11 @@ class Renderer:
         image = np.empty((*size, 3), dtype=np.float32)
         depth, ground_share = np.empty(size, dtype=np.float32), np.empty(size, dtype=np.float32)
         dynamic = self._dynamic_mask(view, moment)
-        found, scratch = np.empty(16, dtype=np.int64), np.empty((4, 16))
+        found, scratch = np.empty(16, dtype=np.int64), np.empty((8, 16))
         shade_image(
-            around, moment.relief, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth, ground_share
-        )
+            around, moment.relief, self.kerbs, mesh, view, samples, 8, solids, dynamic, found, scratch, image, depth,
+            ground_share,
+        )  # fmt: skip
         if self.light.wetness > 0:
             mirror_in_wet(around, moment.relief, view, solids.ground, ground_share, image)
         return RenderedImage(self._develop(image, camera, frame_index), depth)

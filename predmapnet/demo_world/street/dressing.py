@@ -195,4 +195,14 @@ def dress(
     add_moving_traffic(solids, vector_map, road, trajectory, seed)
     clutter = draw_clutter(vector_map, road, trajectory, seed) if cluttered else Clutter()
     clutter = replace(clutter, kerbs=manner.kerbs)
-    return World(name, seed, look, vector_map, trajectory, tuple(surfaces), solids.solids(), clutter)
+    return World(
+        name,
+        seed,
+        look,
+        vector_map,
+        trajectory,
+        tuple(surfaces),
+        solids.solids(),
+        clutter,
+        kerb_height=manner.kerb_height,
+    )
