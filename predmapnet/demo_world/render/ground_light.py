@@ -17,6 +17,8 @@ from predmapnet.demo_world.street.looks import Light
 
 _NEAR_KERB = 1.5
 """Metres from a kerb within which it darkens the road."""
+_FRINGE = 0.075
+"""Metres from a kerb within which the texture is read further away from it."""
 
 
 class Surroundings(NamedTuple):
@@ -196,12 +198,16 @@ def kerb_colour(
         uy = depth * (rotation[1, 0] / view.focal_x - ray[1] * tilt_u)
         vx = depth * (rotation[0, 1] / view.focal_y - ray[0] * tilt_v)
         vy = depth * (rotation[1, 1] / view.focal_y - ray[1] * tilt_v)
-        if kind == ROAD:
-            gap = clearance(kerbs, x, y)
-            if 0 < gap < _NEAR_KERB:
-                # A step hides some of the sky from its foot, and the sun where it stands behind the step.
-                ambient = 1 - 0.4 * max(0.0, 1 - gap / kerbs.height) ** 2
-                sun = 0.0 if in_kerb_shadow(kerbs, x, y, direction, gap) else sun
+        gap = clearance(kerbs, x, y)
+        if kind == ROAD and 0 < gap < _NEAR_KERB:
+            # A step hides some of the sky from its foot, and the sun where it stands behind the step.
+            ambient = 1 - 0.4 * max(0.0, 1 - gap / kerbs.height) ** 2
+            sun = 0.0 if in_kerb_shadow(kerbs, x, y, direction, gap) else sun
+        if abs(gap) < _FRINGE:
+            # The texture's texels mix what lies on both sides of an edge.
+            out_x, out_y = out_of_face(kerbs, x, y)
+            away = (_FRINGE if kind == ROAD else -_FRINGE) - gap
+            x, y = x + away * out_x, y + away * out_y
     red, green, blue, shade = read_ground(around.fine, around.coarse, around.white, x, y, ux, uy, vx, vy, most)
     if kind == FACE:
         red, green, blue = 0.5 * (red + kerbs.tone), 0.5 * (green + 0.98 * kerbs.tone), 0.5 * (blue + 0.93 * kerbs.tone)
