@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from mapfusion.arrays import Byte, Float, Integer32
+from mapfusion.arrays import Byte, Float, Float32, Integer32
 from predmapnet.demo_world.render.jit import kernel, part
 from predmapnet.demo_world.render.relief import Relief, ground_height
 from predmapnet.demo_world.world import World
@@ -219,7 +219,7 @@ def out_of_face(kerbs: Kerbs, x: float, y: float) -> tuple[float, float]:
 
 
 @part
-def in_kerb_shadow(kerbs: Kerbs, x: float, y: float, sun: tuple[float, float, float], gap: float) -> bool:
+def in_kerb_shadow(kerbs: Kerbs, x: float, y: float, sun: Float32, gap: float) -> bool:
     """Whether a kerb keeps the sun from a place on the road, ``gap`` metres from its edge."""
     level = np.sqrt(sun[0] * sun[0] + sun[1] * sun[1])
     if sun[2] <= 0 or gap * sun[2] > kerbs.height * level:
