@@ -163,7 +163,7 @@ def plane_depth(relief: Relief | None, view: View, foot: Footing, ray: Vector) -
 
 @part
 def ground_met(relief: Relief | None, view: View, foot: Footing, kind: Float) -> tuple[Footing, Vector]:
-    """Where a pixel meets one kind of the ground that :func:`sort_ground` found, and the ray that leads there."""
+    """Footing of a pixel on one kind of the ground that :func:`sort_ground` found, and the ray that leads there."""
     ray = pixel_ray(view, kind[1], kind[2])
     depth = plane_depth(relief, view, foot, ray)[0] - kind[3]
     return Footing(depth, foot.east, foot.north, foot.base), ray
