@@ -9,7 +9,16 @@ import numpy as np
 from mapfusion.arrays import Float, Float32
 from predmapnet.demo_world.render.ground_texture import Pyramid
 from predmapnet.demo_world.render.jit import part
-from predmapnet.demo_world.render.kerbs import FACE, ROAD, Kerbs, clearance, in_kerb_shadow, meet_step, out_of_face
+from predmapnet.demo_world.render.kerbs import (
+    FACE,
+    REACH,
+    ROAD,
+    Kerbs,
+    clearance,
+    in_kerb_shadow,
+    meet_step,
+    out_of_face,
+)
 from predmapnet.demo_world.render.raster import Vector, View, pixel_ray
 from predmapnet.demo_world.render.relief import Footing, Relief, facing_of
 from predmapnet.demo_world.render.shading import Colour, headlight, lamp_light, read_ground
@@ -112,12 +121,12 @@ def sort_ground(
 ) -> float:
     """Sort what a pixel, whose middle is (x, y), sees of the ground by its kinds: road, raised ground, faces of kerbs.
 
-    ``foot`` is where its ray meets the plane of the road. ``kinds (3, 4+)`` receives for each kind the share of the
-    pixel, the mean position (x, y), and how far before the plane of the road the ray met it, as a depth. That of the
-    pixel's middle is returned.
+    ``foot`` is where its ray meets the plane of the road. ``kinds (3, 5+)`` receives for each kind the share of the
+    pixel, the mean position (x, y), how far before the plane of the road the ray met it, as a depth, and a distance
+    within which no edge lies. The depth of the pixel's middle is returned.
     """
     for kind in range(3):
-        for column in range(4):
+        for column in range(5):
             kinds[kind, column] = 0.0
     ray = pixel_ray(view, x, y)
     along, _, down, _ = facing_of(relief, view, ray, foot)
@@ -128,7 +137,7 @@ def sort_ground(
     place_x, place_y = view.position[0] + foot.depth * ray[0], view.position[1] + foot.depth * ray[1]
     middle, kind, clear = meet_step(kerbs, place_x, place_y, ray[0], ray[1], -along, 0.5 * foot.depth, least)
     if clear > reach:
-        kinds[kind, 0], kinds[kind, 1], kinds[kind, 2], kinds[kind, 3] = 1.0, x, y, middle
+        kinds[kind, 0], kinds[kind, 1], kinds[kind, 2], kinds[kind, 3], kinds[kind, 4] = 1.0, x, y, middle, clear
         return middle
     for index in range(4):
         # A turned grid: no two of its places share a row or a column.
@@ -172,9 +181,12 @@ def ground_met(relief: Relief | None, view: View, foot: Footing, kind: Float) ->
 @part
 def kerb_colour(
     around: Surroundings, relief: Relief | None, kerbs: Kerbs, view: View, ray: Vector, foot: Footing, dynamic: float,
-    most: int, kind: int,
+    most: int, kind: int, clear: float,
 ) -> Colour:  # fmt: skip
-    """Radiance of ground with kerbs, as :func:`ground_colour` has it: of the road, raised ground, or a kerb's face."""
+    """Radiance of ground with kerbs, as :func:`ground_colour` has it: of the road, raised ground, or a kerb's face.
+
+    It is known that no edge lies within ``clear`` metres.
+    """
     rotation, light, depth = view.rotation, around.light, foot.depth
     x, y, z = view.position[0] + depth * ray[0], view.position[1] + depth * ray[1], view.position[2] + depth * ray[2]
     along, right, down, upright = facing_of(relief, view, ray, foot)
@@ -198,7 +210,7 @@ def kerb_colour(
         uy = depth * (rotation[1, 0] / view.focal_x - ray[1] * tilt_u)
         vx = depth * (rotation[0, 1] / view.focal_y - ray[0] * tilt_v)
         vy = depth * (rotation[1, 1] / view.focal_y - ray[1] * tilt_v)
-        gap = clearance(kerbs, x, y)
+        gap = clearance(kerbs, x, y) if clear < _NEAR_KERB else REACH
         if kind == ROAD and 0 < gap < _NEAR_KERB:
             # A step hides some of the sky from its foot, and the sun where it stands behind the step.
             ambient = 1 - 0.4 * max(0.0, 1 - gap / kerbs.height) ** 2

@@ -19,6 +19,7 @@ from predmapnet.demo_world.render.kerbs import FACE, Kerbs
 from predmapnet.demo_world.render.mesh import Mesh
 from predmapnet.demo_world.render.raster import Vector, View, ZBuffer, ball_depth, pixel_ray
 from predmapnet.demo_world.render.relief import (
+    Footing,
     Relief,
     facing_of,
     first_guess,
@@ -209,8 +210,11 @@ def shade_image(
                             share = kinds_of_ground[kind, 0]
                             if share == 0:
                                 continue
-                            met, ray = ground_met(relief, view, foot, kinds_of_ground[kind])
-                            seen = kerb_colour(around, relief, kerbs, view, ray, met, light_left, most, kind)
+                            met = Footing(here, foot.east, foot.north, foot.base)
+                            if share < 1:
+                                met, ray = ground_met(relief, view, foot, kinds_of_ground[kind])
+                            clear = kinds_of_ground[kind, 4]
+                            seen = kerb_colour(around, relief, kerbs, view, ray, met, light_left, most, kind, clear)
                             colour = (
                                 colour[0] + share * seen[0],
                                 colour[1] + share * seen[1],
