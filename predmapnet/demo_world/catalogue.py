@@ -19,7 +19,7 @@ from predmapnet.demo_world.world import Look, Trajectory, VectorMap, World
 from predmapnet.errors import UserError
 from predmapnet.scenes import Progress, SceneInfo
 
-WORLD_VERSION = 4
+WORLD_VERSION = 5
 """Goes up whenever the same scene would come out differently; old caches are then left alone and not used."""
 
 SPLITS: dict[str, range] = {"train": range(201, 1201), "val": range(1, 11), "test": range(101, 111)}
