@@ -92,7 +92,7 @@ def _across_arm(
     heading = plan_heading(line, arm.station + arm.side * distance, arm.side)
     centre = line.locate(np.array([arm.station + arm.side * distance]))[0]
     walk = heading + np.pi / 2 - lean
-    return _between_kerbs(random, junction.surface, centre, walk, depth, (limits[0], limits[1]), habits)
+    return between_kerbs(random, junction.surface, centre, walk, depth, (limits[0], limits[1]), habits)
 
 
 def plan_heading(line: ReferenceLine, station: float, side: int) -> float:
@@ -108,7 +108,7 @@ def _along_and_aside(line: ReferenceLine, station: float, side: int, point: Floa
     return side * (here - station), side * float(tangent[0] * offset[1] - tangent[1] * offset[0])
 
 
-def _between_kerbs(
+def between_kerbs(
     random: Generator,
     surface: shapely.Geometry,
     centre: Float,
@@ -154,6 +154,6 @@ def cross_street(
     centre = line.locate(np.array([station]))[0]
     lean = np.radians(float(random.normal(0.0, 4.0)))
     depth = float(random.uniform(2.5, 4.5))
-    return _between_kerbs(
+    return between_kerbs(
         random, surface, centre, line.heading(station) + np.pi / 2 - lean, depth, (np.inf, np.inf), habits
     )
