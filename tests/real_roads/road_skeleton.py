@@ -37,7 +37,7 @@ class Street:
     Attributes:
         nodes: of its beginning and its end, rows of ``RoadSkeleton.places``.
         line: ``(n, 2)`` about every metre along its middle.
-        half_width: ``(n,)`` metres to the nearest kerb.
+        half_width: ``(n,)`` metres, smooth, and never more than to the nearest kerb.
     """
 
     nodes: tuple[int, int]
@@ -70,7 +70,7 @@ def road_skeleton(road: Polygon | MultiPolygon) -> RoadSkeleton:
         neighbours.setdefault(first, set()).add(second)
         neighbours.setdefault(second, set()).add(first)
     _prune(neighbours, places, half_width)
-    return _streets(_chains(neighbours), places, half_width)
+    return _streets(_chains(neighbours), places, half_width, shapely.boundary(area))
 
 
 def _without_small_holes(part: Polygon) -> Polygon:
@@ -141,7 +141,7 @@ def _remove(neighbours: dict[int, set[int]], vertices: Chain) -> None:
             neighbours[near].discard(vertex)
 
 
-def _streets(chains: list[Chain], places: Float, half_width: Float) -> RoadSkeleton:
+def _streets(chains: list[Chain], places: Float, half_width: Float, kerbs: shapely.Geometry) -> RoadSkeleton:
     """Merge nodes whose mouths overlap, and make streets of the chains between the others."""
     merged = {end: end for chain in chains for end in (chain[0], chain[-1])}
 
@@ -158,20 +158,20 @@ def _streets(chains: list[Chain], places: Float, half_width: Float) -> RoadSkele
     rows = {node: roots.index(root(node)) for node in merged}
     middles = [places[[node for node in merged if rows[node] == row]].mean(axis=0) for row in range(len(roots))]
     streets = [
-        _street((rows[chain[0]], rows[chain[-1]]), places[chain], half_width[chain])
+        _street((rows[chain[0]], rows[chain[-1]]), places[chain], kerbs)
         for chain in chains
         if rows[chain[0]] != rows[chain[-1]]
     ]
     return RoadSkeleton(np.array(middles).reshape(-1, 2), tuple(streets))
 
 
-def _street(nodes: tuple[int, int], line: Float, half_width: Float) -> Street:
+def _street(nodes: tuple[int, int], line: Float, kerbs: shapely.Geometry) -> Street:
     """A street whose line is smooth, every metre."""
-    stations = arc_length(line)
-    dense = np.linspace(0.0, stations[-1], max(8, int(stations[-1] / 0.5)))
-    sigma = SMOOTHING / (dense[1] - dense[0])
-    smooth = gaussian_filter1d(resample(line, len(dense)), sigma, axis=0, mode="nearest")
-    widths = gaussian_filter1d(np.interp(dense, stations, half_width), sigma, mode="nearest")
-    count = max(4, round(stations[-1]))
-    middle = resample(smooth, count)
-    return Street(nodes, middle, np.interp(np.linspace(0.0, stations[-1], count), dense, widths))
+    length = float(arc_length(line)[-1])
+    dense = resample(line, max(8, int(length / 0.5)))
+    smooth = gaussian_filter1d(dense, SMOOTHING * len(dense) / length, axis=0, mode="nearest")
+    middle = resample(smooth, max(4, round(length)))
+    reach = shapely.distance(kerbs, shapely.points(middle))
+    # Where the kerb bends away into a junction, smoothing alone would put lines beyond it.
+    half_width = np.minimum(gaussian_filter1d(reach, SMOOTHING * len(middle) / length, mode="nearest"), reach)
+    return Street(nodes, middle, half_width)

@@ -163,7 +163,7 @@ def _usual(half_width: Float) -> float:
 def _mouth(stations: Float, half_width: Float) -> int:
     """Row at which a street that begins in a junction has left it: the kerbs run as they do further on."""
     usual = _usual(half_width)
-    settled = (half_width < 1.25 * usual + 0.3) & (stations > 0.8 * usual)
+    settled = (half_width < 1.1 * usual + 0.25) & (stations > 0.8 * usual)
     return int(np.argmax(settled)) if settled.any() else len(stations) // 2
 
 

@@ -7,9 +7,7 @@ import pytest
 import shapely
 from shapely import LineString, Point, Polygon, box
 
-from predmapnet.demo_world.world import Divider
 from predmapnet.errors import UserError
-from tests.real_roads import training_drives
 from tests.real_roads.made_up_paint import made_up_map, read_bare_map
 from tests.real_roads.road_skeleton import road_skeleton
 
@@ -28,13 +26,6 @@ def cross_of_streets(reach=120.0):
 @pytest.fixture(scope="module")
 def maps():
     return [made_up_map(cross_of_streets(), [], seed) for seed in SEEDS]
-
-
-def side(path, line):
-    """Metres by which the middle of a path lies to the left of the street's middle, seen in driving direction."""
-    middle, tangent = path[len(path) // 2], path[-1] - path[0]
-    normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
-    return float((middle - line) @ normal)
 
 
 def streets_paths(vector_map):
@@ -145,12 +136,14 @@ def test_the_same_seed_gives_the_same_map(maps):
 
 def test_driveways_open_the_kerb_in_some_maps():
     way = Polygon([(40, 5.9), (44, 5.9), (44, 30), (40, 30)])
-    areas = {round(shapely.union_all(made_up_map(cross_of_streets(), [way], seed).road_segments).area) for seed in SEEDS}
+    areas = {
+        round(shapely.union_all(made_up_map(cross_of_streets(), [way], seed).road_segments).area) for seed in SEEDS
+    }
     assert min(areas) == round(cross_of_streets().area) and max(areas) > min(areas) + 12
 
 
 def test_a_file_that_is_no_map_is_told(tmp_path):
     path = tmp_path / "broken.json"
     path.write_text(json.dumps({"road_segments": 3}))
-    with pytest.raises(UserError, match="broken.json is no road map"):
+    with pytest.raises(UserError, match=r"broken\.json is no road map"):
         read_bare_map(path, 0)

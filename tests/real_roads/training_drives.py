@@ -139,7 +139,7 @@ def write_drive(drive: RoadDrive, folder: Path) -> None:
     Raises:
         UserError: it cannot be written, or the folder exists.
     """
-    world, rig = _world(drive), tuple(_small(camera) for camera in sample_rig(drive.seed))
+    world, rig = world_of(drive), tuple(_small(camera) for camera in sample_rig(drive.seed))
     lift, to_lidar = np.eye(4), np.eye(4)
     lift[2, 3] = -rig[0].ground_height
     to_lidar[:2, 3] = LIDAR_TO_EGO[:2, 3]
@@ -168,7 +168,7 @@ def true_lines(true_map: VectorMap, stamps: list[int], lidar_to_global: Float) -
     return truth_map(truth, list(zip(stamps, lidar_to_global, strict=True)), STANDARD_REGION)
 
 
-def _world(drive: RoadDrive) -> World:
+def world_of(drive: RoadDrive) -> World:
     """The surroundings, with looks and hills as frequent as among the training scenes."""
     random = np.random.default_rng([0x726F616473, drive.seed])
     look = list(LOOK_SHARES)[int(random.choice(len(LOOK_SHARES), p=list(LOOK_SHARES.values())))]
