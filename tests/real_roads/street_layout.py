@@ -89,7 +89,7 @@ class StreetLayout:
 
     def beside(self, offset: Float | float) -> Float:
         """The line moved to the left, ``(n, 2)``."""
-        return self.line + self.leftward * np.broadcast_to(offset, len(self.line))[:, None]
+        return np.asarray(self.line + self.leftward * np.broadcast_to(offset, len(self.line))[:, None])
 
     def row(self, station: float) -> int:
         """Row of the line at a distance from its beginning."""
