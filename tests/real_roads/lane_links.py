@@ -58,12 +58,12 @@ def linked_lanes(layouts: Sequence[StreetLayout], road: shapely.Geometry) -> tup
 
 
 def _following(end: _End, leaving: Sequence[_End]) -> Iterator[_End]:
-    """One lane of each other street into which one can go on from the end of a lane."""
+    """One lane of each street into which one can go on from the end of a lane."""
     best: dict[int, tuple[float, _End]] = {}
     for other in leaving:
         way = other.point - end.point
         length, turn = float(np.linalg.norm(way)), float(end.direction @ other.direction)
-        if other.street == end.street or turn < MOST_TURN or end.direction @ way < 0 or not 1.0 < length < LONGEST_LINK:
+        if turn < MOST_TURN or end.direction @ way < 0 or not 1.0 < length < LONGEST_LINK:
             continue
         sideways = abs(float(end.direction[0] * way[1] - end.direction[1] * way[0]))
         cost = sideways if turn > STRAIGHT_ON else length

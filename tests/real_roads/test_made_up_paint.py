@@ -120,6 +120,29 @@ def test_lanes_go_on_over_the_junction(maps):
             assert cross_of_streets().buffer(0.5).contains(LineString(link))
 
 
+def direction(path):
+    return (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+
+
+def test_turning_cars_take_the_nearest_lane_of_several(maps):
+    choices = 0
+    for found in maps:
+        streets = streets_paths(found)
+        for link in found.lane_paths:
+            if not LineString(link).intersects(JUNCTION) or abs(direction(link[:2]) @ direction(link[-2:])) > 0.5:
+                continue
+            (taken,) = [path for path in streets if np.linalg.norm(path[0] - link[-1]) < 1e-6]
+            beside = [
+                path
+                for path in streets
+                if direction(path) @ direction(taken) > 0.95 and np.linalg.norm(path[0] - taken[0]) < 15.0
+            ]
+            choices += len(beside) > 1
+            nearest = min(float(np.linalg.norm(path[0] - link[0])) for path in beside)
+            assert np.linalg.norm(link[-1] - link[0]) == pytest.approx(nearest)
+    assert choices > 5
+
+
 def everything(vector_map):
     lines = [divider.points for divider in (*vector_map.dividers, *vector_map.markings)]
     areas = [*vector_map.road_segments, *vector_map.parking, *vector_map.stop_lines]
