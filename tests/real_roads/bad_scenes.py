@@ -19,9 +19,13 @@ from mapfusion.arrays import Float
 from mapfusion.geometry import inverse_pose
 from predmapnet.datasets.images import read_image
 from predmapnet.datasets.own_logs.timed_poses import TimedPoses
+from predmapnet.mapping import FRAMES_AHEAD
 from predmapnet.scenes import Camera, Frame, Instant, Rig, Scene
 from tests.real_roads.image_faults import Fault, Shot
 from tests.real_roads.scene_views import ChosenFrames, SceneView, moved_rig
+
+KEPT = FRAMES_AHEAD + 2
+"""Frames whose images are kept: while one is read, others are asked for."""
 
 
 def chance(scene: Scene, what: str, seed: int) -> np.random.Generator:
@@ -37,13 +41,13 @@ class FaultyImages(SceneView):
         self.fault, self.severity, self.folder, self.seed = fault, severity, folder, seed
 
     def frame(self, index: int) -> Frame:
-        """Return the frame; its images lie in ``folder`` until the next frame is asked for."""
+        """Return the frame; its images lie in ``folder`` while those that a mapper sees ahead are asked for."""
         frame = self.scene.frame(index)
         cameras = {camera.name: camera for camera in frame.rig}
         images = {}
         for name, stored in frame.images.items():
             shot = Shot(frame.scene, index, cameras[name], self.seed)
-            images[name] = self.folder / f"{name}.png"
+            images[name] = self.folder / f"{name}-{index % KEPT}.png"
             image = read_image(stored) if isinstance(stored, Path) else stored
             faulty = self.fault(image, shot, self.severity)
             cv2.imwrite(str(images[name]), faulty[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 0])

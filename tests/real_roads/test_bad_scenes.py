@@ -15,6 +15,7 @@ from predmapnet.datasets.own_logs.calibration import write_rig
 from predmapnet.datasets.own_logs.scene import LogScene
 from predmapnet.datasets.own_logs.timed_poses import TimedPoses, write_timed_poses
 from predmapnet.demo_world.rig import DEMO_RIG
+from predmapnet.mapping import FRAMES_AHEAD
 from tests.benchmarks.bad_days import CLEAN, Remains, conditions, mean_shares
 from tests.real_roads.bad_scenes import (
     FaultyImages,
@@ -67,6 +68,14 @@ def test_faulty_images_reach_the_mapper_as_files_without_loss(scene, tmp_path):
     before, after = scene.frame(3).images["CAM_BACK"], frame.images["CAM_BACK"]
     assert isinstance(after, Path)
     np.testing.assert_array_equal(read_image(after), np.round(read_image(before).astype(int) * 1.8))
+
+
+def test_images_stay_while_frames_are_seen_ahead(scene, tmp_path):
+    bad = FaultyImages(scene, lambda image, shot, _: np.full_like(image, shot.index), 1, tmp_path)
+    frames = [bad.frame(index) for index in range(5, 6 + FRAMES_AHEAD)]
+    for index, frame in enumerate(frames, start=5):
+        for image in frame.images.values():
+            assert isinstance(image, Path) and (read_image(image) == index).all()
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.5, 2.0])
